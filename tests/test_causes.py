@@ -340,7 +340,7 @@ def test_a_tool_that_nobody_weighed_shows_when_it_turns():
 
 def test_a_vibration_is_found_at_its_frequency_and_gone_at_rest():
     r = record("slow")
-    wave = 0.1 * np.sin(2.0 * np.pi * 17.3 * r.time)
+    wave = 0.1 * np.sin(2.0 * np.pi * 17.3 * r.time) * (np.gradient(r.path, r.time) > 2e-3)
     vibration = Vibration().adapted([with_residual("slow", wave)])
     assert vibration.scan is not None
     frequency = vibration.scan.values[0]
@@ -351,6 +351,28 @@ def test_a_vibration_is_found_at_its_frequency_and_gone_at_rest():
     spectrum = np.abs(np.fft.rfft(own[moving] * np.hanning(moving.sum()), 4096))
     at = np.fft.rfftfreq(4096, r.time[1] - r.time[0])[spectrum.argmax()]
     assert at == pytest.approx(17.3, rel=0.05)
+
+
+def test_a_hum_that_goes_with_the_speed_is_found_in_each_condition_and_the_mains_is_none():
+    frequencies = {"slow": 12.0, "fast": 21.0}
+    records = []
+    for condition, frequency in frequencies.items():
+        r = record(condition)
+        moving = np.gradient(r.path, r.time) > 2e-3
+        hum = 0.3 * np.sin(2.0 * np.pi * frequency * r.time) * moving
+        mains = np.sin(2.0 * np.pi * 33.0 * r.time)
+        records.append(with_residual(condition, hum + mains))
+    vibration = Vibration().adapted(records)
+    assert vibration.scan is not None
+    assert all(abs(f - 33.0) > 1.0 for f in vibration.scan.values)
+    mean = vibration.scan.values[-1]
+    assert mean == pytest.approx(16.5, abs=0.2)
+    for condition, frequency in frequencies.items():
+        own = acting(vibration, condition, sine_z=1.0, frequency=mean)[:, Z]
+        moving = within(condition, 0.1, 0.5)
+        spectrum = np.abs(np.fft.rfft(own[moving] * np.hanning(moving.sum()), 4096))
+        at = np.fft.rfftfreq(4096, np.diff(record(condition).time)[0])[spectrum.argmax()]
+        assert at == pytest.approx(frequency, rel=0.05)
 
 
 def test_stick_slip_is_found_at_its_pitch_and_not_there_in_the_air():

@@ -4,14 +4,19 @@ Synthetic records: the sensitivities are given shapes, so that no slice is simul
 """
 
 import dataclasses as dc
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from synthetic_records import COLUMNS, NOISE, ROWS, SPEEDS, VARIATION, record
 
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
-from sliceit_drake.diagnosis.evidence.effect_size import size_by_record, standardised_size
-from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
+from sliceit_drake.diagnosis.evidence.effect_size import (
+    OwnError,
+    size_by_record,
+    standardised_size,
+)
+from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, foretells, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
@@ -131,9 +136,39 @@ def test_a_cause_in_the_air_is_found_where_the_law_is_wrong():
         measured = r.measured + 0.2 * up[:, None]
         found.records[k] = dc.replace(r, columns=columns, measured=measured)
     assert [f.evidence.name for f in reach_verdict(LinearProblem(found), 60).findings] == ["rate"]
-    strict = reach_verdict(LinearProblem(found), 60, rule=DecisionRule(air=30.0))
+    strict = reach_verdict(LinearProblem(found), 60, rule=DecisionRule(gain=30.0))
     why = {c.name: c.why for c in strict.causes}
     assert strict.kind == "unknown" and "a law as wrong as this" in why["rate"]
+
+
+def foretold(sign: Callable[[int], float]) -> tuple[bool, float]:
+    """Whether a wave that all records have alike in the air, but for a sign, foretells records that
+    were left out, and what it removes in contact. There the food hides it, and the law is wrong by
+    as much the other way."""
+    found = problem(42, replicates=4).found
+    rate = [c.name for c in found.columns].index("rate")
+    for k, r in enumerate(found.records):
+        wave, air = 2.0 * NOISE * np.sin(8.0 * r.time), ~r.in_contact
+        columns = r.columns.copy()
+        columns[:, 0, rate] = wave
+        rest = r.measured[:, 0] + wave * np.where(air, sign(k), -0.5)
+        found.records[k] = dc.replace(r, columns=columns, measured=rest[:, None])
+    noise = ChannelNoise(NOISE, 0.1, 0.1 * NOISE, ChannelNoise(0.01 * NOISE, 0.1, 0.1 * NOISE))
+    for r in found.records:
+        r.depth = np.where(r.in_contact, r.depth, -0.01)
+    whole = LinearProblem(found, [noise])
+    cause = "rate", None
+    wrong = OwnError.beside(whole, [cause])
+    return foretells(whole, cause, [], wrong), held_out_gain(whole, [cause]).share
+
+
+def test_a_cause_in_the_air_foretells_records_whatever_the_food_hides():
+    foretells_them, in_contact = foretold(lambda k: 1.0)
+    assert foretells_them and in_contact < 0.0
+
+
+def test_a_cause_that_differs_from_record_to_record_foretells_none():
+    assert not foretold(lambda k: (-1.0) ** k)[0]
 
 
 @pytest.mark.parametrize(("slow", "white"), [(0.99, 0.1), (0.1, 0.99)], ids=["slow", "white"])
@@ -155,6 +190,35 @@ def test_a_wave_is_as_large_as_over_the_noise_at_its_frequency(slow, white):
     size = size_by_record(whole, [skin], ones)
     assert size == pytest.approx(wave / np.sqrt(2.0 * power), rel=0.1)
     assert size >= standardised_size(whole, [skin], ones)
+
+
+def test_noise_is_estimated_anew_beside_an_effect_that_differs_by_record():
+    found = problem(4, replicates=6).found
+    rate = [c.name for c in found.columns].index("rate")
+    amounts = np.random.default_rng(4).normal(size=(len(found.records), 1))
+    for k, r in enumerate(found.records):
+        columns = r.columns.copy()
+        columns[:, 0, rate] = 5.0 * NOISE * np.sin(2.0 * np.pi * 12.0 * r.time)
+        measured = r.measured + amounts[k] * columns[:, :, rate]
+        found.records[k] = dc.replace(r, columns=columns, measured=measured)
+    whole = LinearProblem(found)
+    assert whole.noise[0].deviation > 3.0 * NOISE
+    beside_it = whole.with_noise_beside([rate], amounts)
+    assert beside_it.noise[0].deviation == pytest.approx(NOISE, rel=0.2)
+
+
+def test_a_sensor_that_reads_in_steps_is_unsure_by_what_it_rounds():
+    found, step = problem(5, replicates=4).found, 0.5
+    for k, r in enumerate(found.records):
+        depth = np.where(r.in_contact, r.depth, -0.01)
+        # Nothing differs among replicates but by rounding.
+        measured = step * np.round((r.predicted + 0.1) / step)
+        found.records[k] = dc.replace(r, measured=measured, depth=depth)
+    noise, r = LinearProblem(found).noise[0], found.records[0]
+    assert noise.deviations(r.near).min() >= step / np.sqrt(12.0)
+    # Where the force comes to the next step is as good as chance.
+    late = step * ((r.time > 1.5) & (r.time < 1.6))[:, None]
+    assert (late.T @ noise.solve(r.time, late, 0.0, r.near)).item() < 10.0
 
 
 def uneven(seed: int, up: float = 0.0) -> Sensitivities:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, replicates
 from sliceit_drake.diagnosis.evidence.searches import strongest_frequencies
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
@@ -31,7 +31,8 @@ class ToolWeight(Cause):
 
 
 class Vibration(Cause):
-    """Drives that shake the sensor while they move, at one frequency, in any phase."""
+    """Drives that shake the sensor while they move, in any phase: at one frequency, or at one of
+    each condition's own, as where it goes with the speed."""
 
     name = "vibration"
     family = "robot"
@@ -47,17 +48,28 @@ class Vibration(Cause):
     range = (3.0, 80.0)
     """Frequencies at which it is looked for, Hz."""
 
+    def __init__(self) -> None:
+        self._own: dict[str, float] = {}
+
     def adapted(self, records: Sequence[RecordSensitivity]) -> Cause:
-        """At the frequencies at which the residuals of all records are strongest."""
-        series = []
-        for r in records:
-            moving = np.gradient(r.path, r.time) > REST
-            series.append((r.time[moving], r.residual[moving][:, r.forces]))
-        return _at(self, strongest_frequencies(series, *self.range))
+        """At the frequencies at which the residuals of all records are strongest, and, as a last
+        value of the scan, at that of each condition; the value is then their mean."""
+        own: dict[str, float] = {}
+        for members in replicates(records).values():
+            found = _of_drives([records[k] for k in members], *self.range)
+            own |= {records[k].name: f for f in found[:1] for k in members}
+        mean = (float(np.mean([*own.values()])),) if own else ()
+        out = Vibration()
+        out._own = own
+        return _at(out, _of_drives(records, *self.range) + mean)
 
     def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the waves."""
-        angle = 2.0 * np.pi * values["frequency"] * (series.time - series.time[0])
+        assert self.scan is not None
+        frequency = values["frequency"]
+        if self._own and frequency == self.scan.values[-1]:
+            frequency = self._own.get(facts.name, frequency)
+        angle = 2.0 * np.pi * frequency * (series.time - series.time[0])
         moving = np.tanh(series.speed / REST)
         out = series.wrench.copy()
         for k, axis in enumerate("xyz"):
@@ -113,6 +125,29 @@ class StickSlip(Cause):
         out = series.wrench.copy()
         out[:, 5] += np.where(sliding, -np.sign(series.v[:, 2]) * wave, 0.0)
         return out
+
+
+def _of_drives(records: Sequence[RecordSensitivity], low: float, high: float) -> tuple[float, ...]:
+    """Frequencies at which the residuals are strongest in motion and have less than half of that
+    amplitude at rest: the mains hum at rest as well."""
+    parts: dict[bool, list[tuple[np.ndarray, np.ndarray]]] = {True: [], False: []}
+    for r in records:
+        moving = np.gradient(r.path, r.time) > REST
+        for moves, of in parts.items():
+            rows = moving == moves
+            of.append((r.time[rows], r.residual[rows][:, r.forces]))
+
+    def square(frequency: float, moves: bool) -> float:
+        power = rows = 0.0
+        for time, values in parts[moves]:
+            if len(time):
+                wave = np.exp(2j * np.pi * frequency * time)
+                power += float((np.abs(wave @ (values - values.mean(0))) ** 2).sum())
+                rows += len(time) ** 2
+        return power / max(rows, 1.0)
+
+    found = strongest_frequencies(parts[True], low, high)
+    return tuple(f for f in found if square(f, False) < 0.25 * square(f, True))
 
 
 def _at(cause: Cause, values: tuple[float, ...]) -> Cause:

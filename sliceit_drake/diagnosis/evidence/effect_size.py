@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, RecordSensitivity
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, fit_shared, scaled_inverse
 from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
 
@@ -82,6 +82,19 @@ class OwnError:
             out[rows] = np.sqrt(np.maximum(*(of[rows].mean(0) for of in squares)))
         return np.split(out, np.cumsum([len(v) for v in usual])[:-1])
 
+    def over_scales(self) -> np.ndarray:
+        """Gram matrices of the columns of each record, the residual last, over noise, own error and
+        what the model is unsure of at each row [R, K + 1, K + 1]; 0 for the shapes."""
+        problem = self.problem
+        out = np.zeros_like(problem.moments.gram)
+        at = problem.discrepancy.others
+        for G, record, own in zip(out, problem.found.records, self.scales(), strict=True):
+            columns = np.concatenate([record.columns, record.residual[:, :, None]], axis=2)
+            columns = columns / _scale(problem, record, own)[:, :, None]
+            X = columns.reshape(-1, len(at))
+            G[np.ix_(at, at)] = X.T @ X
+        return out
+
     def by_part(self) -> dict[tuple[str, str, str], float]:
         """Mean square in contact over the noise's, by channel, phase and part."""
         problem, names = self.problem, self.problem.found.records[0].channels
@@ -126,7 +139,7 @@ def standardised_size(
     scales = wrong.scales(found) if wrong is not None else [np.zeros(1)] * len(records)
     effects, free = [], []
     for record, own, g in zip(records, scales, coefficients, strict=True):
-        scale = np.hypot(np.hypot(own, problem.noise_of(record)), problem.model_error(record))
+        scale = _scale(problem, record, own)
         effects.append((record.columns[:, :, list(columns)] @ g / scale).ravel())
         free.append((record.columns[:, :, base] / scale[:, :, None]).reshape(-1, len(base)))
     effect, X = np.concatenate(effects), np.concatenate(free)
@@ -150,18 +163,25 @@ def size_by_record(
         coefficients: Of the columns in each record [R, n], 0 where it does not show.
     """
     own, base = list(columns), problem.base
-    gram = problem.moments.gram
-    inner = gram[np.ix_(range(len(gram)), own, own)]
-    square = np.einsum("ri,rij,rj->", coefficients, inner, coefficients)
-    product = np.einsum("rij,rj->i", gram[np.ix_(range(len(gram)), base, own)], coefficients)
-    square -= product @ scaled_inverse(gram.sum(0)[np.ix_(base, base)]) @ product
-    effects = []
+    gram, effects = np.zeros((len(base) + 1, len(base) + 1)), []
     for record, g in zip(problem.found.records, coefficients, strict=True):
-        scale = np.hypot(problem.noise_of(record), problem.model_error(record))
-        effects.append((record.columns[:, :, own] @ g / scale).ravel())
+        effect, error = record.columns[:, :, own] @ g, problem.model_error(record)
+        effects.append((effect / _scale(problem, record, np.zeros(1))).ravel())
+        X = np.concatenate([record.columns[:, :, base], effect[:, :, None]], axis=2).astype(float)
+        for c, noise in enumerate(problem.noise):
+            gram += X[:, c].T @ noise.solve(record.time, X[:, c], error[:, c], record.near)
+    product = gram[:-1, -1]
+    square = gram[-1, -1] - product @ scaled_inverse(gram[:-1, :-1]) @ product
     rows = int(_acts(np.concatenate(effects)).sum())
     whitened = float(np.sqrt(max(square, 0.0) / rows)) if rows else 0.0
     return max(whitened, standardised_size(problem, columns, coefficients))
+
+
+def _scale(problem: LinearProblem, record: RecordSensitivity, own: np.ndarray) -> np.ndarray:
+    """What an effect is compared with at each row, own error of the simulation included [m, c]."""
+    return np.asarray(
+        np.hypot(np.hypot(own, problem.noise_of(record)), problem.model_error(record))
+    )
 
 
 def _acts(effect: np.ndarray) -> np.ndarray:

@@ -6,10 +6,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
+from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.prediction.discrepancy import Sizes
 
-__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
+__all__ = [
+    "HeldOutGain",
+    "fitted_changes",
+    "foretells",
+    "held_out_gain",
+    "held_out_share",
+    "own_coefficients",
+]
 
 BOOTSTRAP = 1000
 MIN_REDUCIBLE = 0.02
@@ -30,8 +38,6 @@ class HeldOutGain:
         by_record: Error of each record before and after [R, 2], N.
         share: Of what is above the floor in the mean square, that the causes remove.
         interval: 90 % interval of the share, from records drawn anew.
-        counted: Fraction of the causes' doing, squared, at the rows that this error counts: that of
-            a delay is where the force jumps, and is not counted.
     """
 
     before: float
@@ -40,7 +46,6 @@ class HeldOutGain:
     by_record: np.ndarray
     share: float
     interval: tuple[float, float]
-    counted: float = 1.0
 
 
 def held_out_gain(
@@ -48,8 +53,6 @@ def held_out_gain(
     causes: Sequence[CauseAtScan],
     seed: int = 0,
     simulated: LinearProblem | None = None,
-    beside: Sequence[CauseAtScan] = (),
-    sizes: Sizes | None = None,
 ) -> HeldOutGain:
     """Leaves out each record in turn, with and without causes.
 
@@ -59,13 +62,11 @@ def held_out_gain(
         seed: For the interval.
         simulated: The moments as the extended food predicts them, at values that were fitted to all
             records; by default causes are fitted from where they are absent.
-        beside: Those of the causes that are in the model before as well.
-        sizes: Of the discrepancy beside which causes are fitted; none by default, as in a file.
     """
     named = problem.found.of_causes(causes)
-    without = _errors(problem, beside, named, None if sizes is None else problem.sizes)
     fitted = simulated is not None
-    squares = np.array([without, _errors(simulated or problem, causes, named, sizes, fitted)])
+    without = _errors(problem, (), named)
+    squares = np.array([without, _errors(simulated or problem, causes, named, fitted=fitted)])
     counts = problem.moments.force_rows
     rng = np.random.default_rng(seed)
     touched = np.flatnonzero(counts > 0)
@@ -83,8 +84,36 @@ def held_out_gain(
         by_record=np.sqrt(squares / np.maximum(counts, 1)).T,
         share=_share(mean, noise),
         interval=(low, high),
-        counted=_counted(problem, [c for c in causes if c not in beside]),
     )
+
+
+def foretells(
+    problem: LinearProblem,
+    cause: CauseAtScan,
+    beside: Sequence[CauseAtScan],
+    wrong: OwnError,
+    seed: int = 0,
+) -> bool:
+    """Whether records that were left out may be predicted better with a cause than without.
+
+    All rows and channels count, each over its noise and what the simulation gets wrong there: a
+    cause in the air is judged in the air, and one where the force is small where it is small.
+
+    Args:
+        problem: The records.
+        cause: That all records share.
+        beside: Causes that are in the model before as well.
+        wrong: What the simulation gets wrong beside all of them.
+        seed: Of the records that are drawn anew.
+
+    Returns:
+        Whether the 95 % quantile of the gain is positive.
+    """
+    grams, named = wrong.over_scales(), problem.found.of_causes([*beside, cause])
+    before = _errors(problem, beside, named, problem.sizes, grams=grams)
+    gains = before - _errors(problem, [*beside, cause], named, wrong.sizes, grams=grams)
+    drawn = np.random.default_rng(seed).choice(gains, (BOOTSTRAP, len(gains)))
+    return bool(np.quantile(drawn.sum(1), 0.95) > 0.0)
 
 
 def held_out_share(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> float:
@@ -93,20 +122,6 @@ def held_out_share(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> flo
     named = problem.found.of_causes(causes)
     squares = np.array([_errors(problem, (), named), _errors(problem, causes, named)])
     return _share(squares.sum(1) / total, _noise(problem))
-
-
-def _counted(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> float:
-    columns = problem.found.of_causes(causes)
-    shared = [k for k in columns if not problem.found.columns[k].per_record]
-    linear = _Linear(problem, causes)
-    theta = linear.shared()[len(linear.columns) - len(shared) :] if shared else np.zeros(0)
-    inside = counted = 0.0
-    for record in problem.found.records:
-        change = record.columns[:, problem.forces][:, :, shared] @ theta
-        squares = (change**2).sum(1)
-        inside += float(squares[record.in_contact].sum())
-        counted += float(squares[problem.calm(record)].sum())
-    return counted / max(inside, 1e-12)
 
 
 def _noise(problem: LinearProblem) -> float:
@@ -143,8 +158,9 @@ def _errors(
     not_usual: Sequence[int],
     sizes: Sizes | None = None,
     fitted: bool = False,
+    grams: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Sum of squared force errors in contact of each record when it is left out [R], N^2.
+    """Sum of squared errors of each record when it is left out [R].
 
     Args:
         problem: The records' moments.
@@ -153,13 +169,14 @@ def _errors(
         sizes: Of the discrepancy.
         fitted: Whether the prediction has the values of all records: then only what these values
             owe to the record is taken out of it.
+        grams: Gram matrices of what is squared; by default of the force in contact, N^2.
     """
     linear = _Linear(problem, causes, not_usual, sizes)
     whole = linear.shared()
     inside = [*problem.base, *problem.found.of_causes(causes)]
     whole[~np.isin(linear.columns, inside)] = 0.0
     out = np.zeros(len(problem.found.records))
-    for r, H in enumerate(problem.moments.force_gram):
+    for r, H in enumerate(problem.moments.force_gram if grams is None else grams):
         theta = linear.shared(r) - fitted * whole
         left = np.zeros(len(H))
         left[-1] = 1.0

@@ -240,6 +240,25 @@ class LinearProblem:
         """Standard deviation of the noise at each row [m, c]."""
         return np.column_stack([n.deviations(record.near) for n in self.noise])
 
+    def with_noise_beside(
+        self, columns: Sequence[int], coefficients: np.ndarray
+    ) -> "LinearProblem":
+        """The same problem, its moments as they are, with the noise estimated anew beside an effect
+        that differs from record to record: replicates do not share it, so that it is in their
+        noise.
+
+        Args:
+            columns: Numbers of the effect's columns [n].
+            coefficients: Of the columns in each record [R, n].
+        """
+        out = copy.copy(self)
+        records = [
+            dc.replace(r, predicted=r.predicted + r.columns[:, :, list(columns)] @ g)
+            for r, g in zip(self.found.records, coefficients, strict=True)
+        ]
+        out.noise, _ = estimate_noise(records, self.own, list(self.usual_own))
+        return out
+
     def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
         """The same problem, weights included, about another prediction of each record [m, c]."""
         out = copy.copy(self)

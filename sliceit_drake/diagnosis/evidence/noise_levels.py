@@ -26,6 +26,10 @@ MIN_ROWS = 300
 """Rows in the air, and as many in the food, from which each has a noise of its own."""
 FLOOR = 1e-3
 """Least standard deviation, in N and Nm."""
+LONGEST = 10.0
+"""Greatest correlation time, s."""
+STAYS = 0.5
+"""Readings come in steps where less than this share of them differs from the one before."""
 
 
 @dc.dataclass(frozen=True)
@@ -37,12 +41,14 @@ class ChannelNoise:
         tau: Its correlation time, s.
         white: Standard deviation of the rest.
         air: Noise in the air, independent of that in the food; None for the same.
+        stays: Rows for which a reading in steps stays: it is rounded once for all of them.
     """
 
     ar: float
     tau: float
     white: float
     air: "ChannelNoise | None" = None
+    stays: float = 0.0
 
     @property
     def deviation(self) -> float:
@@ -74,7 +80,10 @@ class ChannelNoise:
             parts = [(near, self), (~near, self.air)]
         for rows, noise in parts:
             if rows.any():
-                white = np.hypot(noise.white, error[rows])
+                # Jumps from step to step are as usual as what is rounded is large.
+                white = np.hypot(
+                    np.hypot(noise.white, noise.ar * np.sqrt(noise.stays)), error[rows]
+                )
                 covariance = MarkovCovariance(np.diff(time[rows]), noise.ar, noise.tau, white)
                 out[rows] = covariance.solve(columns[rows])
         return out
@@ -112,11 +121,14 @@ def estimate_noise(
             known[air[:, 0]] = _beside(rest[air[:, 0]], columns[air[:, 0]])
             airborne.append((grid, known, factor))
     channels = range(len(records[0].channels))
+    steps = _resolution(records)
     if min(map(_rows, (in_food, airborne))) >= MIN_ROWS:
-        parts = [(_channel(in_food, c), _channel(airborne, c)) for c in channels]
+        parts = [
+            (_channel(in_food, c, steps[c]), _channel(airborne, c, steps[c])) for c in channels
+        ]
         return tuple(dc.replace(of_food, air=of_air) for of_food, of_air in parts), True
     series = whole or [_roughness(r) for r in records]
-    return tuple(_channel(series, c) for c in channels), bool(whole)
+    return tuple(_channel(series, c, steps[c]) for c in channels), bool(whole)
 
 
 def differences(
@@ -179,8 +191,24 @@ def _roughness(record: RecordSensitivity) -> Series:
     return record.time[inside], rest, 1.0 / (1.0 - 1.0 / width)
 
 
-def _channel(series: list[Series], c: int) -> ChannelNoise:
-    """Fits the autocovariance of a channel."""
+def _resolution(records: Sequence[RecordSensitivity]) -> list[tuple[float, float]]:
+    """Step in which each channel's readings come, the same for all forces, 0 where they do not; and
+    the rows for which they stay."""
+    changes = [np.abs(np.diff(r.measured, axis=0)) for r in records]
+    out = []
+    for c in range(len(records[0].channels)):
+        alike = records[0].forces if c in records[0].forces else [c]
+        values = np.concatenate([change[:, alike].ravel() for change in changes])
+        moved = values[values > 1e-9]
+        in_steps = 0 < len(moved) < STAYS * len(values)
+        own = np.concatenate([change[:, c] for change in changes])
+        stays = len(own) / (len(records) + np.count_nonzero(own > 1e-9))
+        out.append((float(np.quantile(moved, 0.1)) if in_steps else 0.0, float(stays)))
+    return out
+
+
+def _channel(series: list[Series], c: int, steps: tuple[float, float]) -> ChannelNoise:
+    """Fits the autocovariance of a channel whose readings come in steps; see `_resolution`."""
     step = float(np.median(np.concatenate([np.diff(t) for t, _, _ in series])))
     sums, counts = np.zeros(LAGS), np.zeros(LAGS)
     for _, rest, factor in series:
@@ -192,6 +220,10 @@ def _channel(series: list[Series], c: int) -> ChannelNoise:
             counts[lag] += known.sum()
     used = counts > 0
     covariance = sums[used] / counts[used]
+    rounding = steps[0] / np.sqrt(12.0)
+    if covariance[0] < rounding**2:
+        # Replicates are rounded alike, and stay so for as long as the force is steady.
+        return ChannelNoise(float(rounding), LONGEST, float(0.1 * rounding), stays=steps[1])
     lags = np.arange(LAGS)[used] * step
     total = max(float(covariance[0]), FLOOR**2)
 
@@ -202,7 +234,7 @@ def _channel(series: list[Series], c: int) -> ChannelNoise:
         return model - covariance / total
 
     start = np.array([np.clip(covariance[1] / total, 0.05, 0.95) if len(lags) > 1 else 0.5, -3.5])
-    fit = least_squares(misfit, start, bounds=([0.0, np.log(step)], [0.99, np.log(10.0)]))
+    fit = least_squares(misfit, start, bounds=([0.0, np.log(step)], [0.99, np.log(LONGEST)]))
     share, tau = float(fit.x[0]), float(np.exp(fit.x[1]))
     ar = max(np.sqrt(share * total), 0.1 * FLOOR)
     white = max(np.sqrt((1.0 - share) * total), 0.1 * np.sqrt(total))

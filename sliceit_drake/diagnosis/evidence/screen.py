@@ -397,7 +397,9 @@ def _evidence(
     )
     if out.score > 0.0:
         if out.per_record:
-            out.size = left = size_by_record(problem, columns, fits * shown[:, None])
+            fits = fits * shown[:, None]
+            beside_it = problem.with_noise_beside(columns, fits)
+            out.size = left = size_by_record(beside_it, columns, fits)
         else:
             wrong = OwnError(problem, problem.with_causes([*statistics.taken, *active]), sizes)
             out.size = standardised_size(problem, columns, value, wrong)

@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
-from sliceit_drake.diagnosis.evidence.held_out import held_out_gain
+from sliceit_drake.diagnosis.evidence.held_out import foretells
 from sliceit_drake.diagnosis.evidence.linear import (
     PLAUSIBLE,
     LinearProblem,
@@ -50,10 +50,9 @@ class DecisionRule:
     Attributes:
         alarm: Greatest chance that a simulation as wrong as this one, with nothing else wrong,
             gives a gain as large as the largest.
-        gain: Least gain, twice in log-likelihood, for each record and each multiple of the noise
-            that the simulation is wrong by beside the cause: where it is wrong in a form that the
-            prior does not have, causes gain up to this.
-        air: In place of that multiple where the knife touches nothing, and no law can be wrong.
+        gain: Least gain, twice in log-likelihood, for each record, times what the simulation is
+            wrong by beside the cause over the noise, or 1 where that is less, as in the air: where
+            it is wrong in a form that the prior does not have, causes gain up to this.
         beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
@@ -69,7 +68,6 @@ class DecisionRule:
 
     alarm: float = 0.02
     gain: float = 1.1
-    air: float = 0.3
     beside: float = 3.0
     size: float = 0.9
     limit: float = 0.1
@@ -199,7 +197,8 @@ def reach_verdict(
     if len(findings) > 1:
         findings = _lasting(problem, findings, rule)
     named = bool(findings)
-    wrong, misfit, mostly = _own_error(problem, [f.evidence.cause for f in findings])
+    named_causes = [f.evidence.cause for f in findings]
+    wrong, misfit, mostly = _own_error(OwnError.beside(problem, named_causes))
     causes = _verdicts(screenings, findings, refused, rule)
     shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
     if not named and misfit >= rule.unknown and mostly[0][1:3] == ("in", "shared"):
@@ -285,17 +284,15 @@ def _refusal(
     if _at_bound(e):
         return _at_bound(e)
     before = [*screening.assumed]
-    # A law cannot be wrong in the air, where there is only noise of another kind.
+    # A law cannot be wrong in the air.
     inside = 1.0 if e.per_record else _share_in_contact(problem, e)
-    wrong_by = inside * max(_own_error(problem, [*before, e.cause])[1], 1.0)
-    wrong_by += (1.0 - inside) * rule.air
+    wrong = OwnError.beside(problem, [*before, e.cause])
+    wrong_by = 1.0 + inside * max(_own_error(wrong)[1] - 1.0, 0.0)
     least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
     if e.gain < least:
         return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
-    if not e.per_record:
-        gain = held_out_gain(problem, [*before, e.cause], beside=before, sizes=e.sizes)
-        if gain.counted >= 0.5 and gain.interval[1] <= 0.0:
-            return "does not foretell records that were left out"
+    if not e.per_record and not foretells(problem, e.cause, before, wrong):
+        return "does not foretell records that were left out"
     return ""
 
 
@@ -408,11 +405,11 @@ def _lasting(
 
 
 def _own_error(
-    problem: LinearProblem, named: Sequence[CauseAtScan]
+    wrong: OwnError,
 ) -> tuple[float, float, list[tuple[str, str, str, float]]]:
     """Of the simulation with what is named: relative to the force, to the noise, and where."""
+    problem = wrong.problem
     noise = np.array([n.deviation for n in problem.noise])
-    wrong = OwnError.beside(problem, named)
     squares, force, over, rows = 0.0, 0.0, 0.0, 0
     for record, values in zip(problem.found.records, wrong.values, strict=True):
         inside = record.in_contact
