@@ -180,6 +180,20 @@ def test_a_food_that_is_not_where_the_force_begins_is_refused(shift, words):
     assert error.value.field == "p_WK_z" and "food.position" in error.value.fix
 
 
+def test_noise_above_a_food_is_no_contact():
+    records = slices()
+    air, cut = records[0].metadata.motion.phases[:2]
+    air.end = cut.start = 0.25
+    # 4 to 5 mm above the food.
+    above = np.flatnonzero((records[0].time > 0.25) & (records[0].time < 0.3))
+    records[0].force[above[::3], 2] += 0.2 * records[0].force_magnitude.max()
+    assert check_records(records, CUCUMBER) == []
+    # What lasts is one.
+    records[0].force[above, 2] += 0.2 * records[0].force_magnitude.max()
+    with pytest.raises(ConfigurationError, match="begins 5.0 mm above the top"):
+        check_records(records, CUCUMBER)
+
+
 def test_a_knife_that_never_reaches_the_food_is_refused():
     records = slices()
     records[0].metadata.food.position[2] -= 0.1

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food
@@ -28,6 +29,8 @@ CONTACT = 0.1
 CUTTING = ("slice", "second_pass", "hold", "retract")
 EARLY, LATE = 2e-3, 0.5
 """How far above the food contact may begin, metres, and how deep in it, of its height."""
+LASTING = 9
+"""Rows over more than half of which a force is there for certain."""
 LEAST_ROWS = 40
 """Rows of a record from which noise can be told from a force."""
 OFF_BOARD = 5e-3
@@ -279,8 +282,10 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
     if air.any() and float(force[air].max()) > CONTACT * peak:
         # Weight, vibration or a sensor's zero: where contact begins does not show in the force.
         return
-    begins = int(np.argmax(cut & (force > CONTACT * peak)))
-    if not EARLY >= above[begins] >= -LATE * height:
+    # One row over it is noise, which has more rows over the food than in the air.
+    touches = cut & (median_filter(force, LASTING) > CONTACT * peak)
+    begins = int(np.argmax(touches))
+    if touches.any() and not EARLY >= above[begins] >= -LATE * height:
         where = f"{1e3 * abs(above[begins]):.1f} mm {'above' if above[begins] > 0 else 'below'}"
         raise ConfigurationError(
             f"the force begins {where} the top of the food, which is {1e3 * height:.0f} mm high",
