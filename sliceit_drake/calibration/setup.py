@@ -20,7 +20,7 @@ from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
 from sliceit_drake.records.slice_record import SliceRecord
-from sliceit_drake.resources import named_yaml, shipped_names
+from sliceit_drake.resources import known_yaml
 
 __all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup", "setup_of_record"]
 
@@ -180,17 +180,9 @@ def load_setup(name: str | Path) -> CalibrationSetup:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    file = named_yaml(name, FOLDER)
-    if file is None:
-        raise ConfigurationError(
-            f"{name!r} is no food that a setup ships for: {', '.join(shipped_names(FOLDER))}",
-            field="--food",
-            fix=did_you_mean(
-                str(name),
-                shipped_names(FOLDER),
-                "Name one of them, or give a YAML file of a setup.",
-            ),
-        )
+    unknown = f"{name!r} is no food that a setup ships for:"
+    otherwise = "Name one of them, or give a YAML file of a setup."
+    file = known_yaml(name, FOLDER, unknown, "--food", otherwise)
     setup = load_yaml(CalibrationSetup, file)
     assert isinstance(setup, CalibrationSetup)
     setup.food.look_beside(file)
