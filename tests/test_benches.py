@@ -34,7 +34,8 @@ from studies.benches.strips import Strips
 from studies.benches.variation import SliceVariation
 from studies.results import write_json
 
-BENCHES = Path(__file__).resolve().parent.parent / "studies" / "benches"
+ROOT = Path(__file__).resolve().parent.parent
+BENCHES = ROOT / "studies" / "benches"
 FOREIGN = ("slice_push", "bonds", "strips")
 PLAIN = {"slice_push": SlicePush(), "bonds": Bonds(), "strips": Strips()}
 SIDE = 0.03
@@ -467,6 +468,29 @@ def test_the_table_has_rows_for_naming_nothing_the_top_and_the_oracle(tmp_path, 
     assert found["earlier", "diagnosis"][8].startswith("100 %")
     assert found["earlier", "always nothing"][8].startswith("0 %")
     assert found["affected", "diagnosis"][-1].startswith("100 %")
+
+
+def test_the_page_has_each_reported_run():
+    page = (ROOT / "docs/results/benches.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    shown = {tuple(row[:2]): row[3:] for row in rows if len(row) == 5}
+    reports = (ROOT / "docs/results/benches_report.jsonl").read_text(encoding="utf-8")
+    laws = set()
+    for report in map(json.loads, reports.splitlines()):
+        law, effect = report["case"]["law"], report["case"]["effect"] or "nothing"
+        laws.add(law)
+        for said, text in zip(
+            (report["earlier"], report["affected"]), shown[law, effect], strict=True
+        ):
+            found = [finding["cause"] for finding in said.get("findings", [])]
+            assert text.startswith(
+                "no answer" if "failure" in said else ", ".join(found) or said["verdict"]
+            )
+            if "failure" not in said and not found:
+                assert said["evidence"][0]["cause"] in text
+    runs = (ROOT / "docs/results/benches_runs.jsonl").read_text(encoding="utf-8")
+    assert {law for run in map(json.loads, runs.splitlines()) for law in run["laws"]} == laws
+    assert all(run["commit"][:7] in page for run in map(json.loads, runs.splitlines()))
 
 
 def test_a_diagnosis_that_breaks_down_is_kept_as_a_failure(tmp_path):

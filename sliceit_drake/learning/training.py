@@ -25,15 +25,16 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.workers import children_without_interrupts, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
+from sliceit_drake.learning.fixed_slices import cut_fixed_slices
 from sliceit_drake.learning.model_card import model_card
 from sliceit_drake.learning.network import HistoryExtractor, export_policy
 from sliceit_drake.learning.reward import HEIGHT, REACH, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
 from sliceit_drake.learning.training_config import CONFIGURATION, POLICY, TrainingConfig
-from sliceit_drake.systems.agent import ERROR, Decide, observation_names
+from sliceit_drake.systems.agent import ERROR, observation_names
 
-__all__ = ["CHECKPOINT", "Outcome", "cut_fixed_slices", "make_model", "train", "value_limit"]
+__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "value_limit"]
 
 CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
 MODEL, CARD = "model.zip", "README.md"
@@ -131,6 +132,9 @@ def train(
             if callback.best_actor is not None:
                 model.actor.load_state_dict(callback.best_actor)
             export_policy(model.actor, config.task.agent, output / POLICY)
+            # Half as large; the checkpoint has them.
+            for optimizer in (model.actor.optimizer, model.critic.optimizer):
+                optimizer.state.clear()
             # For `stable_baselines3.SAC.load`, which knows nothing of these.
             model.save(output / MODEL, exclude=["value_limit", "running"])
             (output / CARD).write_text(_card(config, outcome, output), encoding="utf-8")
@@ -238,36 +242,6 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
     raise ConfigurationError(
         problem, field="output", source=str(file), fix="Give another folder, or delete it."
     )
-
-
-def cut_fixed_slices(decide: Decide, env: SlicingEnv, slices: int, seed: int) -> dict[str, float]:
-    """Lets a policy cut fixed slices.
-
-    Args:
-        decide: The policy.
-        env: Of the training's task.
-        slices: How many, of the task's foods in turn.
-        seed: Of the first; those of the others follow.
-
-    Returns:
-        Means over the slices: return (discounted, as it is trained), length in decisions, force
-        (mean, N), peak (N), and the fraction that reached the goal.
-    """
-    foods, discount = env.task.foods, env.task.reward.discount
-    env.progress, rows = 1.0, []
-    for k in range(slices):
-        food = foods[k % len(foods)]
-        observation, _ = env.reset(seed=seed + k, options={"food": food})
-        rewards, forces, done = [], [], False
-        while not done:
-            observation, reward, terminated, truncated, info = env.step(decide(observation))
-            rewards.append(reward)
-            forces.append(info["force"])
-            done = terminated or truncated
-        worth = float(np.array(rewards) @ discount ** np.arange(len(rewards)))
-        rows.append((worth, len(rewards), np.mean(forces), max(forces), info["is_success"]))
-    names = ("return", "length", "force", "peak", "goal")
-    return dict(zip(names, np.mean(np.array(rows, float), axis=0).tolist(), strict=True))
 
 
 class _Watch(BaseCallback):

@@ -14,8 +14,8 @@ from scipy.optimize import differential_evolution
 from tqdm import tqdm
 
 from sliceit_drake.learning.environment import SlicingEnv
+from sliceit_drake.learning.fixed_slices import cut_fixed_slices
 from sliceit_drake.learning.task import TaskConfig
-from sliceit_drake.learning.training import cut_fixed_slices
 from sliceit_drake.systems.agent_rule import AgentRule
 from studies.learning.rules import FAST, nothing
 
