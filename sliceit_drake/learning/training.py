@@ -137,7 +137,9 @@ def train(
                 optimizer.state.clear()
             # For `stable_baselines3.SAC.load`, which knows nothing of these.
             model.save(output / MODEL, exclude=["value_limit", "running"])
-            (output / CARD).write_text(_card(config, outcome, output), encoding="utf-8")
+            steps = outcome.steps if callback.best is None else callback.best_steps
+            card = model_card(config, steps, outcome.ends, callback.best)
+            (output / CARD).write_text(card, encoding="utf-8")
         summary = json.dumps(dc.asdict(outcome), indent=2) + "\n"
         (output / "summary.json").write_text(summary, encoding="utf-8")
         return outcome
@@ -150,15 +152,6 @@ def train(
         # A process that has ended cannot be told to end.
         with contextlib.suppress(EOFError, ConnectionError):
             environments.close()
-
-
-def _card(config: TrainingConfig, outcome: Outcome, output: Path) -> str:
-    steps, found = outcome.steps, None
-    if outcome.best_return is not None:
-        rows = map(json.loads, (output / VALIDATION).read_text(encoding="utf-8").splitlines())
-        found = next(row for row in rows if row["steps"] == outcome.best_steps)
-        steps = outcome.best_steps
-    return model_card(config, steps, outcome.ends, found)
 
 
 def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
@@ -266,6 +259,7 @@ class _Watch(BaseCallback):
         self._validation: SlicingEnv | None = None
         self.validations, self._validated_at = 0, config.warm_up
         self.best_return, self.best_steps = -math.inf, 0
+        self.best: dict[str, float] | None = None
         self.best_actor: dict[str, torch.Tensor] | None = None
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -273,7 +267,7 @@ class _Watch(BaseCallback):
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
         self.validations, self._validated_at = state["validations"]
         self._sums = [Counter(sums) for sums in state["sums"]]
-        self.best_return, self.best_steps, self.best_actor = state["best"]
+        self.best_return, self.best_steps, self.best, self.best_actor = state["best"]
 
     def outcome(self, wall_time: float) -> Outcome:
         guarded = sum(self._guards.values())
@@ -337,6 +331,7 @@ class _Watch(BaseCallback):
         self.logger.dump(self.num_timesteps)
         if found["return"] > self.best_return:
             self.best_return, self.best_steps = found["return"], self.num_timesteps
+            self.best = found
             self.best_actor = copy.deepcopy(self.model.actor.state_dict())
 
     def _save(self) -> None:
@@ -353,7 +348,7 @@ class _Watch(BaseCallback):
                 "guards": dict(self._guards),
                 "validations": (self.validations, self._validated_at),
                 "sums": [dict(sums) for sums in self._sums],
-                "best": (self.best_return, self.best_steps, self.best_actor),
+                "best": (self.best_return, self.best_steps, self.best, self.best_actor),
             },
         }
         # Whole or not at all.
