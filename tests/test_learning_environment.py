@@ -334,12 +334,6 @@ def test_half_of_the_force_for_twice_the_time_costs_half(force, term):
     assert found == pytest.approx(term, abs=1e-12)
 
 
-def test_a_hard_landing_may_cost_more_than_the_same_force_above():
-    config, force = RewardConfig(force_scale=40.0, landing=3.0), np.array([0.0, -20.0])
-    terms = [reward_terms(config, height, force, np.zeros(3)) for height in (2.1e-3, 1.9e-3, -1e-3)]
-    assert [term[1] for term in terms] == pytest.approx([-0.25, -0.75, -0.75])
-
-
 def test_the_term_of_the_jerk_ends_at_one():
     assert reward_terms(RewardConfig(), 0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
 

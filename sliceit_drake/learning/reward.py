@@ -11,7 +11,6 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
-from sliceit_drake.systems.agent import NEAR
 
 __all__ = [
     "HEIGHT",
@@ -47,8 +46,6 @@ class RewardConfig:
     """Shape of the force term: the square of force over scale, at most 1, or SliceIt!'s."""
     force_scale: float = quantity(40.0, "N", low=0.01, high=1e3)
     """Scale of the force term. A sigmoid is half at three times as much; 2 in SliceIt!."""
-    landing: float = quantity(1.0, "", low=0.0, high=100.0)
-    """Factor on the force term less than 2 mm over the board: a price of landing hard."""
     goal: float = quantity(15.0, "", low=0.0)
     """Reward for a slice that is done; 100 in SliceIt!."""
     way: float = quantity(15.0, "", low=0.0)
@@ -70,7 +67,7 @@ class RewardConfig:
 def reward_terms(
     config: RewardConfig, height: float, force: np.ndarray, jerk: np.ndarray
 ) -> np.ndarray:
-    """Distance, force, jerk and step, each from -1 to 0, the force's by its factor [4].
+    """Distance, force, jerk and step, each from -1 to 0 [4].
 
     Args:
         config: Shape and scale of the force term.
@@ -80,11 +77,10 @@ def reward_terms(
     """
     share = float(np.linalg.norm(force)) / config.force_scale
     square = config.force_shape == "square"
-    factor = config.landing if height < NEAR else 1.0
     return np.array(
         [
             -np.tanh(5.0 * abs(height) / HEIGHT),
-            -factor * (min(share**2, 1.0) if square else 1.0 / (1.0 + np.exp(3.0 - share))),
+            -min(share**2, 1.0) if square else -1.0 / (1.0 + np.exp(3.0 - share)),
             -min(float(np.linalg.norm(jerk)), 1.0),
             -1.0,
         ]

@@ -36,7 +36,7 @@ from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.policy import envelope, envelope_time
 
-__all__ = ["ACTIONS", "ERROR", "NEAR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
+__all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
 
 ACTIONS = ("stiffness_x", "stiffness_ry", "p_z", "p_ry", "draw", "press")
 """What the numbers of an action decide."""
