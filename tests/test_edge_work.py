@@ -169,6 +169,19 @@ def test_soft_food_that_is_sawn_by_less_than_it_gives_is_cut_as_by_a_press(gives
         cut_box([saw], **soft)
 
 
+def test_how_much_work_the_edge_may_owe_is_for_the_user_to_say():
+    saw = PressAndDraw(5e-3, HEIGHT + 6e-3, amplitude=3e-4, frequency=5.3)
+    soft = {"youngs_modulus": 2e5, "toughness": 100.0}
+    with pytest.raises(CuttingError, match="less work"):
+        cut_box([saw], **soft)
+    result = cut_box([saw], numerics=Numerics(work_error=0.5), **soft)
+    due = 100.0 * WIDTH * HEIGHT
+    owed = 1.0 - (result.balance.edge + result.balance.opening) / due
+    assert 0.02 < owed < 0.5
+    with pytest.raises(CuttingError, match="less work"):
+        cut_box([saw], numerics=Numerics(work_error=0.9 * owed), **soft)
+
+
 @pytest.mark.parametrize("xi", [1.0, 3.0])
 def test_a_draw_through_soft_food_follows_atkins_and_is_calm(xi):
     spread = Numerics(edge_spread=1e-3)

@@ -231,6 +231,12 @@ def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(mon
     assert np.array_equal(rollout(env, 3, seed=4), expected)
 
 
+def test_each_variant_may_owe_the_work_that_the_task_says():
+    station = make_agent_station(TaskConfig(work_error=0.07), "potato", np.random.default_rng(0))
+    solvers = station.station.cutting.solvers
+    assert {solver.model.numerics.work_error for solver in solvers} == {0.07}
+
+
 @pytest.mark.parametrize("seed", [6, 117], ids=["tomato", "cucumber"])
 def test_sawing_at_random_ends_by_no_guard(seed):
     """The food moves with the knife, and the edge does a little less work than it should."""

@@ -5,7 +5,6 @@ import copy
 import dataclasses as dc
 import functools
 import json
-import math
 import multiprocessing
 import os
 import pickle
@@ -258,7 +257,7 @@ class _Watch(BaseCallback):
         self._sums: list[Counter] = [Counter() for _ in range(config.environments)]
         self._validation: SlicingEnv | None = None
         self.validations, self._validated_at = 0, config.warm_up
-        self.best_return, self.best_steps = -math.inf, 0
+        self.best_steps = 0
         self.best: dict[str, float] | None = None
         self.best_actor: dict[str, torch.Tensor] | None = None
 
@@ -267,7 +266,7 @@ class _Watch(BaseCallback):
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
         self.validations, self._validated_at = state["validations"]
         self._sums = [Counter(sums) for sums in state["sums"]]
-        self.best_return, self.best_steps, self.best, self.best_actor = state["best"]
+        self.best_steps, self.best, self.best_actor = state["best"]
 
     def outcome(self, wall_time: float) -> Outcome:
         guarded = sum(self._guards.values())
@@ -283,7 +282,7 @@ class _Watch(BaseCallback):
             wall_time,
             dict(self._guards),
             dict(self._ends),
-            self.best_return if self.best_actor is not None else None,
+            None if self.best is None else self.best["return"],
             self.best_steps,
             failed,
         )
@@ -329,9 +328,8 @@ class _Watch(BaseCallback):
         for name, value in found.items():
             self.logger.record(f"validation/{name}", value)
         self.logger.dump(self.num_timesteps)
-        if found["return"] > self.best_return:
-            self.best_return, self.best_steps = found["return"], self.num_timesteps
-            self.best = found
+        if self.best is None or found["return"] > self.best["return"]:
+            self.best, self.best_steps = found, self.num_timesteps
             self.best_actor = copy.deepcopy(self.model.actor.state_dict())
 
     def _save(self) -> None:
@@ -348,7 +346,7 @@ class _Watch(BaseCallback):
                 "guards": dict(self._guards),
                 "validations": (self.validations, self._validated_at),
                 "sums": [dict(sums) for sums in self._sums],
-                "best": (self.best_return, self.best_steps, self.best, self.best_actor),
+                "best": (self.best_steps, self.best, self.best_actor),
             },
         }
         # Whole or not at all.

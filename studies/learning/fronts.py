@@ -10,7 +10,6 @@ figures/learning_fronts.png to --output.
 import argparse
 import dataclasses as dc
 import json
-import re
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -29,7 +28,8 @@ from sliceit_drake.systems.agent import AgentConfig, Decide
 from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import load_network
 from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
-from studies.learning.rules import FAST, TUNED, nothing, uniform, with_draw
+from studies.learning.rules import FAST, TUNED, uniform, with_draw
+from studies.learning.tune_rule import BOUNDS
 from studies.pages import publish, render_and_store
 
 __all__ = [
@@ -100,13 +100,15 @@ def decider(case: Case) -> tuple[AgentConfig, Decide]:
         text = f"{case.food}{case.slice}".encode()
         return agent, uniform(np.random.default_rng([int(number), case.seed, *text]))
     if kind == "press":
-        rule = dc.replace(rule, reach=0.0, softness=1.0, landing=1.0)
-        return dc.replace(agent, rule=rule), nothing
-    if kind in ("rule", "fast rule"):
-        draw = FAST if kind == "fast rule" else agent.draw_increment
-        return dc.replace(agent, draw_increment=draw, rule=rule), nothing
-    if kind == "tuned rule":
-        return dc.replace(agent, draw_increment=FAST, rule=TUNED), nothing
+        agent.rule = dc.replace(rule, reach=0.0, softness=1.0, landing=1.0)
+    elif kind == "tuned rule":
+        agent.rule = TUNED
+    elif kind in ("rule", "fast rule"):
+        agent.rule = rule
+    if agent.rule is not None:
+        if kind in ("fast rule", "tuned rule"):
+            agent.draw_increment = FAST
+        return agent, load_network(agent)
     simulator, _, other = kind.partition(", ")
     folder = resource_path(f"models/policies/{simulator}_{int(number)}")
     # All end their slices alike, whatever the policy was trained with.
@@ -339,7 +341,7 @@ def run(options: argparse.Namespace) -> int:
             "world": options.world.replace("_", "-"),
             "slices": options.slices,
             "seed": options.seed,
-            "tuned": re.sub(r"^AgentRule|, correction.*(?=\))", "", str(TUNED)),
+            "tuned": f"({', '.join(f'{name}={getattr(TUNED, name)}' for name in BOUNDS)})",
             "command": options.command,
         },
         points,

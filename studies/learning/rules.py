@@ -5,18 +5,13 @@ import numpy as np
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, Decide, observation_names
 from sliceit_drake.systems.agent_rule import AgentRule
 
-__all__ = ["FAST", "TUNED", "nothing", "uniform", "with_draw"]
+__all__ = ["FAST", "TUNED", "uniform", "with_draw"]
 
 DRAW = ACTIONS.index("draw")
 NAMES = observation_names(AgentConfig().history)
 FAST = 7.5e-3
 """Draw of a decision at 150 mm/s, the limit of the optimised motions, m."""
 PLACE, LAST = NAMES.index("target_x"), NAMES.index("last_draw")
-
-
-def nothing(_: np.ndarray) -> np.ndarray:
-    """Decides for zeros: what is done is the rule's."""
-    return np.zeros(len(ACTIONS))
 
 
 def with_draw(decide: Decide, rule: AgentRule | None) -> Decide:

@@ -17,9 +17,10 @@ from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.fixed_slices import cut_fixed_slices
 from sliceit_drake.learning.task import TaskConfig
 from sliceit_drake.systems.agent_rule import AgentRule
-from studies.learning.rules import FAST, nothing
+from sliceit_drake.systems.exported_network import load_network
+from studies.learning.rules import FAST
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["BOUNDS", "add_arguments", "run"]
 
 BOUNDS = {
     "level": (6.0, 40.0),
@@ -70,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
             # All stations of the environment have this rule. To build them takes longer.
             for name, value in zip(BOUNDS, key, strict=True):
                 setattr(rule, name, value)
-            known[key] = cut_fixed_slices(nothing, env, SLICES, SEED)
+            known[key] = cut_fixed_slices(load_network(task.agent), env, SLICES, SEED)
             with options.output.open("a", encoding="utf-8") as file:
                 file.write(json.dumps({"rule": key, **known[key]}) + "\n")
         bar.update()
