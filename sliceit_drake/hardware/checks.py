@@ -208,6 +208,11 @@ def check_start(state: RobotState, start: Sequence[float], config: HardwareConfi
         return [Check("start pose", False, found, "Check the network, and the robot's log.")]
     off = [a - b for a, b in zip(state.q, start, strict=True)]
     worst = max(range(6), key=lambda j: abs(off[j]))
+    near = abs(off[worst]) <= config.start_tolerance
+    # Where all are near, rounding alone decides which of them is the worst.
+    named = f"joints are at most {abs(off[worst]):.4f}"
+    if not near:
+        named = f"joint {worst + 1} is {off[worst]:+.4f}"
     turns = [j + 1 for j in range(6) if abs(abs(off[j]) - 2.0 * math.pi) < 0.5]
     fix = "Move it there with --move-to-start, or on the pendant."
     if turns:
@@ -216,8 +221,8 @@ def check_start(state: RobotState, start: Sequence[float], config: HardwareConfi
     return [
         Check(
             "start pose",
-            abs(off[worst]) <= config.start_tolerance,
-            f"joint {worst + 1} is {off[worst]:+.4f} rad off, allowed {config.start_tolerance:g}",
+            near,
+            f"{named} rad off, allowed {config.start_tolerance:g}",
             fix,
         ),
         Check("at rest", fastest < 0.01, f"fastest joint {fastest:.4f} rad/s", "Wait."),
