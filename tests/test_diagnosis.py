@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic_records import COLUMNS, NOISE, ROWS, SPEEDS, VARIATION, record
 
-from sliceit_drake.diagnosis.evidence.columns import Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.effect_size import (
     OwnError,
     size_by_record,
@@ -19,6 +19,7 @@ from sliceit_drake.diagnosis.evidence.effect_size import (
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, foretells, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
+from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
 from studies.hidden_effects.sizes import effect_in_noise
 
@@ -119,6 +120,54 @@ def test_two_hidden_causes_are_both_named():
     verdict = reach_verdict(problem(30, rate=2.5, fading_at_1p0=0.6), 60)
     assert verdict.kind == "causes"
     assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
+
+
+def bounded(stands_for_rate: bool) -> LinearProblem:
+    """A rate that is beyond its range, and a skin that acts as a part of it does, or is there."""
+    found = problem(31, rate=2.5, skin=0.0 if stands_for_rate else 2.5).found
+    names = [c.name for c in found.columns]
+    rate, skin = names.index("rate"), names.index("skin")
+    range_of = {"rate": {"low": -0.1, "high": 0.1}, "skin": {"one_sided": False}}
+    columns = [
+        dc.replace(c, **range_of.get(c.name, {})) for c in found.columns if c.name != "skin_like"
+    ]
+    kept = [k for k, name in enumerate(names) if name != "skin_like"]
+    records = []
+    for r in found.records:
+        values = r.columns.copy()
+        if stands_for_rate:
+            values[:, :, skin] = values[:, :, rate] * (0.9 + 0.1 * (r.time < 1.0))[:, None]
+        records.append(dc.replace(r, columns=values[:, :, kept], even=r.even[:, :, kept]))
+    return LinearProblem(Sensitivities(columns, records))
+
+
+def test_a_cause_that_stands_for_one_at_its_bound_is_not_named():
+    verdict = reach_verdict(bounded(True), 60)
+    why = {c.name: c.why for c in verdict.causes}
+    assert not verdict.names
+    assert why["rate"] == "exponent would be at a bound"
+    assert "beside rate, whose" in why["skin"]
+
+
+def test_a_cause_is_named_beside_one_at_its_bound_where_it_gains_by_itself():
+    assert reach_verdict(bounded(False), 60).names == [["skin"]]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_jump_that_replicates_share_is_no_slip(shared):
+    found = problem(43).found
+    knock = Column("cause", "slip", "knock", per_record=True, alone=True)
+    for k, r in enumerate(found.records):
+        pulse = np.exp(-np.abs(r.time - (0.5 if shared else 0.3 + 0.15 * (k % 3))) / 0.03)
+        columns = np.concatenate([r.columns, pulse[:, None, None]], axis=2)
+        measured, even = r.measured + 1.5 * pulse[:, None], np.zeros_like(columns)
+        found.records[k] = dc.replace(r, columns=columns, measured=measured, even=even)
+    whole = LinearProblem(Sensitivities([*found.columns, knock], found.records))
+    e = screen(whole, 60).evidence("slip")
+    assert (e.gain <= e.limit) == shared
+    assert (e.presence < 0.4) == shared
+    if not shared:
+        assert np.median(e.by_record) == pytest.approx(1.5, rel=0.15)
 
 
 def test_what_no_cause_explains_is_unknown():

@@ -113,6 +113,7 @@ class Cause:
         parameters: Its numbers.
         scan: A number that exists only where the cause does, or None.
         per_record: Whether each record has values of its own, as the phase of a vibration.
+        alone: Whether it is what a slice has for itself: what its replicates share is not of it.
         searched: Twice the gain in log-likelihood that `adapted` finds where there is nothing.
         by_slice: Whether it goes by which slice of the session or of the knife it is
             (`SliceFacts.slice_index`, `knife_slices`).
@@ -128,6 +129,7 @@ class Cause:
     parameters: tuple[CauseParameter, ...] = ()
     scan: Scan | None = None
     per_record = False
+    alone = False
     searched = 0.0
     by_slice = False
     uses_force = False

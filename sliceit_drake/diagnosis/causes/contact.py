@@ -15,7 +15,7 @@ class StaticFriction(Cause):
 
     name = "static_friction"
     family = "knife and contact"
-    parameters = (CauseParameter("share", "", 0.5, low=0.0, high=5.0),)
+    parameters = (CauseParameter("share", "", 0.5, low=0.0, high=20.0),)
     scan = Scan("speed", "m/s", (3e-3, 1e-2, 3e-2))
     absorbed_by = ("material.static_friction",)
     signature = "as friction, less the faster the knife; flips its sign on withdrawal"

@@ -86,7 +86,7 @@ class FoodSlip(Cause):
     family = "board, holder, geometry"
     parameters = tuple(CauseParameter(f"knock_{a}", "N", 1.0) for a in "xyz")
     scan = Scan("fading", "s", (0.02, 0.05, 0.12))
-    per_record = True
+    per_record = alone = True
     searched = 45.0
     signature = "an abrupt change at no certain depth, sideways above all; does not repeat"
     experiment = "repeats"

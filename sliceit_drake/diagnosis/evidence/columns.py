@@ -29,7 +29,7 @@ class Column:
         unit: Of it; "" for a logarithm.
         one_sided: Whether its coefficient cannot be negative.
         per_record: Whether each record has a coefficient of its own.
-        searched: `Cause.searched`.
+        searched, alone: `Cause.searched` and `Cause.alone`.
         low, high: Range of the parameter's distance from its null.
     """
 
@@ -42,6 +42,7 @@ class Column:
     one_sided: bool = False
     per_record: bool = False
     searched: float = 0.0
+    alone: bool = False
     low: float = -np.inf
     high: float = np.inf
 

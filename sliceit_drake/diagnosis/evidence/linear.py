@@ -28,6 +28,7 @@ from sliceit_drake.diagnosis.evidence.noise_levels import (
     estimate_noise,
     in_air,
 )
+from sliceit_drake.diagnosis.evidence.searches import unlike_others
 from sliceit_drake.prediction.discrepancy import (
     USUAL_SHARE,
     Covariates,
@@ -263,7 +264,8 @@ class LinearProblem:
         """The same problem, weights included, about another prediction of each record [m, c]."""
         out = copy.copy(self)
         out._reduced = {}
-        vars(out).pop("sizes", None)
+        for kept in ("sizes", "apart"):
+            vars(out).pop(kept, None)
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
         records = []
         for r, (record, values) in enumerate(zip(self.found.records, predicted, strict=True)):
@@ -277,6 +279,15 @@ class LinearProblem:
         out.found = dc.replace(self.found, records=records)
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
+
+    @functools.cached_property
+    def apart(self) -> "LinearProblem":
+        """The problem of what each record does not share with its replicates."""
+        rests = unlike_others(self.found.records)
+        records = zip(self.found.records, rests, strict=True)
+        return self.predicting(
+            [r.measured - rest - (0.0 if r.bent is None else r.bent) for r, rest in records]
+        )
 
     def reduced(self, model: Model) -> np.ndarray:
         """Gram matrices with what is each record's own integrated out [R, K + 1, K + 1]."""

@@ -205,23 +205,31 @@ class _Statistics:
     def own_gain(self, columns: list[int]) -> float:
         """Gain of a cause with numbers of its own in each record."""
         problem = self.problem
+        if problem.found.columns[columns[0]].alone:
+            return float(self.own_fits(columns)[2].sum())
         model = problem.with_causes([*self.taken, *columns])
         grams = problem.by_condition(model)
         prior = model.prior[model.shared]
         value, _ = problem.discrepancy.likelihood(grams, self.sizes, model.shared, prior)
         return 2.0 * (value - 0.5 * problem.own_log_det(model) - self.value)
 
-    def own_fits(self, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients of columns for each record by itself [R, n], and what they gain there [R];
-        0 where a record knows nothing of them."""
-        reduced = self.problem.reduced(self.model)
-        out, gains = np.zeros((len(reduced), len(columns))), np.zeros(len(reduced))
+    def own_fits(self, columns: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coefficients of columns for each record by itself [R, n], what they explain there [R],
+        and their gains [R]; 0 where a record knows nothing of them."""
+        alone = self.problem.found.columns[columns[0]].alone
+        reduced = (self.problem.apart if alone else self.problem).reduced(self.model)
+        out, (explained, gains) = (
+            np.zeros((len(reduced), len(columns))),
+            np.zeros((2, len(reduced))),
+        )
         for r, A in enumerate(reduced):
             inner, b = A[np.ix_(columns, columns)], A[columns, -1]
             if np.diag(inner).min() > 1e-9:
-                out[r] = np.linalg.solve(inner + np.eye(len(columns)) / PLAUSIBLE**2, b)
-                gains[r] = float(out[r] @ b)
-        return out, gains
+                inner = inner + np.eye(len(columns)) / PLAUSIBLE**2
+                out[r] = np.linalg.solve(inner, b)
+                explained[r] = float(out[r] @ b)
+                gains[r] = explained[r] - np.linalg.slogdet(inner * PLAUSIBLE**2)[1]
+        return out, explained, gains
 
 
 class _Chance:
@@ -369,7 +377,7 @@ def _evidence(
     shown = np.zeros(0, bool)
     value, error = np.zeros(len(columns)), np.full(len(columns), np.inf)
     if kinds[0].per_record:
-        fits, own_gains = statistics.own_fits(columns)
+        fits, own_gains, _ = statistics.own_fits(columns)
         shown = own_gains > kinds[0].searched + PRESENT * len(columns)
         presence = float(shown.sum() / max((own_gains > 0.0).sum(), 1))
         own = fits[np.abs(fits).max(1) > 0.0]

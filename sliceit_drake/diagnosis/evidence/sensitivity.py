@@ -101,7 +101,7 @@ def _cause_changes(cause: Cause, point: Point) -> list[_Change]:
             values = tuple(cause.nulls(value) | {p.name: p.null + step} for step in steps)
             traits = p.step, p.unit, p.one_sided, cause.per_record, cause.searched
             within = p.low - p.null, p.high - p.null
-            column = Column("cause", cause.name, p.name, value, *traits, *within)
+            column = Column("cause", cause.name, p.name, value, *traits, cause.alone, *within)
             ends = tuple(
                 dc.replace(point, causes=(*point.causes, ActiveCause(cause, v))) for v in values
             )

@@ -184,9 +184,19 @@ def reach_verdict(
         screenings.append(screening)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             break
-        best = None
+        best, bounded = None, []
         for e in sorted(screening.causes, key=lambda e: -e.gain):
             why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
+            if why and why == _at_bound(e):
+                bounded.append(e)
+            for other in bounded if not why else ():
+                # What gains less than a cause that is refused may only stand for it.
+                assumed_too = [*assumed, other.cause]
+                again = screen(problem, replicates, seed + len(findings), assumed_too)
+                why = _refusal(problem, again, again.evidence(e.name), rule)
+                if why:
+                    why = f"{why}, beside {other.name}, whose {_at_bound(other)}"
+                    break
             if not why:
                 best = e
                 break
