@@ -378,7 +378,8 @@ class AgentSystem(PlainSystem):
         force = float(np.hypot(*self._history(context)[-FELT:, :2].mean(axis=0)))
         place = self._value(context, self._offset)[0] / max(self._config.draw, 1e-9)
         way = self._value(context, self._action)[ACTIONS.index("draw")]
-        return rule.action(float(error[1]), force, float(place), float(way))
+        speed = (self._value(context, self._errors)[1] - error[1]) / self._config.period
+        return rule.action(float(error[1]), float(speed), force, float(place), float(way))
 
     def _target(self, context: Context) -> np.ndarray:
         """The target's place from the start, along Kx and Kz [2], m."""

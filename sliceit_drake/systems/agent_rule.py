@@ -8,8 +8,13 @@ from sliceit_drake.configuration import quantity
 
 __all__ = ["AgentRule"]
 
-LANDING = 0.01
-"""Height over the board within which the level falls, metres."""
+LANDING = 4e-3
+"""Height over the board within which level and draw fall, metres. A draw tilts the knife as it turns
+round, so that the edge goes up and down by a millimetre: near the board it would hit it."""
+CREEP = 5e-3
+"""Speed downwards at which it may always be, m/s."""
+BRAKE = 200.0
+"""Of the press on what is more than the speed that it may have, s/m."""
 
 
 @dc.dataclass
@@ -24,24 +29,35 @@ class AgentRule:
     """Fraction of the farthest draw at which it turns round; 0 for no draw."""
     softness: float = quantity(-1.0, "", low=-1.0, high=1.0)
     """Gain downwards, within its range from -1 to 1, where the force is at its level."""
-    landing: float = quantity(0.3, "", low=0.01, high=1.0)
+    landing: float = quantity(0.2, "", low=0.01, high=1.0)
     """Fraction of the level that is left at the board."""
+    calm: float = quantity(0.1, "", low=0.0, high=1.0)
+    """Fraction of the draw that is left there."""
+    approach: float = quantity(0.1, "s", low=0.0, high=10.0)
+    """Least time to the board at the speed that it has; 0 for no limit."""
     correction: float = quantity(0.5, "", low=0.0, high=2.0)
     """Most by which a network changes each of its actions."""
 
-    def action(self, height: float, force: float, place: float, way: float) -> np.ndarray:
+    def action(
+        self, height: float, speed: float, force: float, place: float, way: float
+    ) -> np.ndarray:
         """The action [6].
 
         Args:
             height: Height of the edge over the board, m.
+            speed: At which that falls, m/s.
             force: Felt force, N.
             place: Target along the edge, over the farthest draw.
             way: Action of the draw before.
         """
-        level = self.level * min(1.0, self.landing + max(height, 0.0) / LANDING)
-        push = self.gain * (1.0 - force / level)
+        height = max(height, 0.0)
+        near = height / LANDING
+        push = self.gain * (1.0 - force / (self.level * min(1.0, self.landing + near)))
+        softness, draw = self.softness + push, self.draw(place, way) * min(1.0, self.calm + near)
+        if self.approach > 0.0:
+            push -= BRAKE * max(speed - CREEP - height / self.approach, 0.0)
         stiffness = [1.0, 0.0]
-        action = [*stiffness, self.softness + push, 0.0, self.draw(place, way), push]
+        action = [*stiffness, softness, 0.0, draw, push]
         return np.clip(action, -1.0, 1.0)
 
     def draw(self, place: float, way: float) -> float:

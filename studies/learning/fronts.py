@@ -100,7 +100,7 @@ def decider(case: Case) -> tuple[AgentConfig, Decide]:
         text = f"{case.food}{case.slice}".encode()
         return agent, uniform(np.random.default_rng([int(number), case.seed, *text]))
     if kind == "press":
-        agent.rule = dc.replace(rule, reach=0.0, softness=1.0, landing=1.0)
+        agent.rule = dc.replace(rule, reach=0.0, softness=1.0, landing=1.0, approach=0.0)
     elif kind == "tuned rule":
         agent.rule = TUNED
     elif kind in ("rule", "fast rule"):
