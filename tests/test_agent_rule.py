@@ -9,8 +9,8 @@ from sliceit_drake.systems.agent_rule import AgentRule
 DRAW, PRESS, SOFT = (ACTIONS.index(name) for name in ("draw", "press", "p_z"))
 
 
-def acted(rule, force=0.0, height=0.03, place=0.0, way=0.0):
-    return rule.action(height, force, place, way)
+def acted(rule, force=0.0, height=0.03, place=0.0, way=0.0, speed=0.0):
+    return rule.action(height, speed, force, place, way)
 
 
 def test_it_draws_on_to_its_reach_and_back():
@@ -31,3 +31,14 @@ def test_it_presses_where_it_feels_less_than_its_level_and_gives_way_where_more(
     # At the board its level is lower.
     assert acted(AgentRule(10.0, landing=0.5), 5.0, 0.0)[PRESS] == pytest.approx(0.0)
     assert (np.abs(acted(rule, 1e3)) <= 1.0).all()
+
+
+def test_near_the_board_it_draws_less_and_brakes():
+    rule = AgentRule(10.0, calm=0.1, approach=0.1)
+    assert acted(rule, height=4e-3)[DRAW] == 1.0
+    assert acted(rule, height=1e-3)[DRAW] == pytest.approx(0.35)
+    assert acted(rule, height=-1e-3, way=0.1)[DRAW] == pytest.approx(0.1)
+    # At 2 mm it may have 20 mm/s and the 5 mm/s that it may always have.
+    assert acted(rule, height=2e-3, speed=0.025)[PRESS] == 1.0
+    assert acted(rule, height=2e-3, speed=0.03)[PRESS] == pytest.approx(0.0)
+    assert acted(AgentRule(10.0, approach=0.0), height=2e-3, speed=0.5)[PRESS] == 1.0

@@ -153,6 +153,8 @@ TESTED = {
         " --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/{cutting,spring}_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/results/slicing_evaluation.jsonl",
+        "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e4 3e3 3e5"
+        " --output docs/results/corrected_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
         "sliceit simulate cucumber_agent",
@@ -161,6 +163,8 @@ TESTED = {
         "python -m studies slicing output/evaluation.jsonl --output output",
         "python -m studies slicing docs/results/slicing_evaluation.jsonl"
         " --policies models/policies/cutting_0 models/policies/spring_0 --output docs/results",
+        "python -m studies slicing docs/results/corrected_evaluation.jsonl"
+        " docs/results/slicing_evaluation.jsonl --ours corrected --output docs/results",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
         "sliceit optimize-motion scenarios/cucumber_measured.yaml --output FOLDER",

@@ -200,10 +200,11 @@ def test_policies_are_evaluated_without_what_trained_them():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-def test_the_page_is_that_of_the_slices(tmp_path, capsys):
-    file = ROOT / "docs/results/slicing_evaluation.jsonl"
-    assert studies(["slicing", str(file), "--output", str(tmp_path)]) == 0
-    for name in ("slicing_results.md", "slicing_results.json"):
+@pytest.mark.parametrize(("ours", "stem"), [("cutting", "slicing"), ("corrected", "corrected")])
+def test_the_page_is_that_of_the_slices(ours, stem, tmp_path, capsys):
+    files = [str(ROOT / f"docs/results/{name}_evaluation.jsonl") for name in {stem, "slicing"}]
+    assert studies(["slicing", *files, "--ours", ours, "--output", str(tmp_path)]) == 0
+    for name in (f"{stem}_results.md", f"{stem}_results.json"):
         assert (tmp_path / name).read_text() == (ROOT / "docs/results" / name).read_text()
     capsys.readouterr()
 

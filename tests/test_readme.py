@@ -130,6 +130,8 @@ def test_written_port_contract_is_that_of_the_code():
 COMPARED = {
     "benches_report.jsonl": "test_benches.py::test_the_page_has_each_reported_run",
     "benches_runs.jsonl": "test_benches.py::test_the_page_has_each_reported_run",
+    "corrected_evaluation.jsonl": "test_learning_comparison.py::test_the_page_is_that_of_the_",
+    "corrected_results.json": "test_learning_comparison.py::test_the_page_is_that_of_the_slices",
     "coverage.jsonl": "test_readme.py::test_the_page_on_coverage_is_that_of_its_replicates",
     "faster_draws.jsonl": "test_learning_comparison.py::test_the_table_of_faster_draws_is_that_of",
     "hidden_effects.json": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",

@@ -9,8 +9,8 @@ from sliceit_drake.configuration import quantity
 __all__ = ["AgentRule"]
 
 LANDING = 4e-3
-"""Height over the board within which level and draw fall, metres. A draw tilts the knife as it turns
-round, so that the edge goes up and down by a millimetre: near the board it would hit it."""
+"""Height over the board within which level and draw fall, metres. A draw tilts the knife as it
+turns round: the edge goes up and down by a millimetre, and near the board would hit it."""
 CREEP = 5e-3
 """Speed downwards at which it may always be, m/s."""
 BRAKE = 200.0

@@ -4,7 +4,9 @@ EVALUATION is what `sliceit evaluate` wrote for policies of both kinds; all must
 slices. Ratios are cutting over spring, of means over policies and slices; the intervals (95 %) come
 from a bootstrap of policies and slices. Writes to --output slicing_results.md, its ratios as
 slicing_results.json, figures/slicing_forces.png, and with --policies
-figures/slicing_two_slices.png, for which two slices of the stand-in's cucumber are cut anew.
+figures/slicing_two_slices.png, for which two slices of the stand-in's cucumber are cut anew. With
+--ours corrected, ours are those that correct a rule, and corrected_results and corrected_forces are
+written.
 """
 
 import argparse
@@ -26,6 +28,7 @@ from studies.pages import publish, render
 
 __all__ = [
     "PAPER",
+    "WHOSE",
     "Comparison",
     "add_arguments",
     "claim",
@@ -45,11 +48,23 @@ PAPER = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
 OURS, BASELINE = "cutting", "spring"
 COLOURS = {OURS: "#1b7a5a", BASELINE: "#b5532a"}
 NAMES = {OURS: "cutting simulator", BASELINE: "spring only"}
+WHOSE = {
+    "cutting": ("slicing", "policies that were trained in the cutting simulator"),
+    "corrected": (
+        "corrected",
+        "policies that correct a rule with draws of up to 150 mm/s "
+        "([learning.md](../explanation/learning.md#a-rule-and-what-corrects-it))",
+    ),
+}
+"""By the first word of our policies' names: that of the files, and what they are."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument("evaluation", metavar="EVALUATION", type=Path, help=".jsonl")
+    parser.add_argument("evaluations", nargs="+", metavar="EVALUATION", type=Path, help=".jsonl")
+    parser.add_argument(
+        "--ours", choices=WHOSE, default=OURS, help="first word of our policies' names"
+    )
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, required=True, help="where page and figures go"
     )
@@ -64,29 +79,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     try:
-        lines = options.evaluation.read_text(encoding="utf-8").splitlines()
-        rows = [json.loads(line) for line in lines]
-        found = compare(rows)
+        texts = [file.read_text(encoding="utf-8") for file in options.evaluations]
+        rows = [json.loads(line) for text in texts for line in text.splitlines()]
+        found = compare(rows, options.ours)
     except (OSError, ValueError, KeyError) as error:
         raise ConfigurationError(
             f"cannot be compared ({error})",
-            source=str(options.evaluation),
+            source=", ".join(map(str, options.evaluations)),
             fix="Give what `sliceit evaluate` wrote for policies of both simulators.",
         ) from error
     if not found:
         raise ConfigurationError(
             "has no slices that policies of both simulators cut",
-            source=str(options.evaluation),
+            source=", ".join(map(str, options.evaluations)),
             fix="Evaluate policies of `sliceit train --simulator cutting` and `spring`.",
         )
     figures = options.output / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    page = options.output / "slicing_results.md"
-    publish(comparison_page(found), page, [_facts(each) for each in found])
+    stem, _ = WHOSE[options.ours]
+    page = options.output / f"{stem}_results.md"
+    publish(comparison_page(found, options.ours), page, [_facts(each) for each in found])
     boards = sorted({each.board_stiffness for each in found})
     usual = boards[len(boards) // 2]
     plot_boxes(
-        [each for each in found if each.board_stiffness == usual], figures / "slicing_forces.png"
+        [each for each in found if each.board_stiffness == usual], figures / f"{stem}_forces.png"
     )
     if options.policies:
         plot_two_slices(_two_slices(options.policies), figures / "slicing_two_slices.png")
@@ -116,19 +132,22 @@ class Comparison:
     strict: Ratio
 
 
-def compare(rows: Sequence[Mapping]) -> list[Comparison]:
+def compare(rows: Sequence[Mapping], ours: str = OURS) -> list[Comparison]:
     """Compares what `sliceit evaluate` wrote, where both kinds of policies cut the same slices.
 
     The comparisons are in the order of worlds, boards and foods, those of the paper first.
 
     Args:
         rows: Its lines.
+        ours: First word of the names of our policies; others of the cutting simulator are left out.
 
     Raises:
         ValueError: A policy did not cut all slices that others did.
     """
     groups: dict[tuple, dict] = {}
     for row in rows:
+        if row["simulator"] == OURS and not Path(row["policy"]).name.startswith(ours):
+            continue
         key = (row["world"], row["food"], row["board_stiffness"])
         group = groups.setdefault(key, collections.defaultdict(dict))
         group[row["simulator"], row["policy"]][row["slice"]] = row
@@ -222,8 +241,8 @@ def _two_slices(policies: Sequence[str]) -> dict[str, list[SliceTrace]]:
     }
 
 
-def comparison_page(found: Sequence[Comparison]) -> str:
-    """The page; the paper's ratio stands beside the foods that it cut."""
+def comparison_page(found: Sequence[Comparison], ours: str = OURS) -> str:
+    """The page; the paper's ratio stands beside the foods that it cut; `ours` as of `compare`."""
     rows = []
     for each in found:
         ours, baseline = each.values[OURS], each.values[BASELINE]
@@ -241,7 +260,10 @@ def comparison_page(found: Sequence[Comparison]) -> str:
             cells += [means, interval(each.ratios[metric])]
         paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
         rows.append([*cells, interval(each.strict), paper])
-    return render("slicing_results", claim=claim(found), titles=TITLES, rows=rows)
+    stem, what = WHOSE[ours]
+    return render(
+        "slicing_results", claim=claim(found), titles=TITLES, rows=rows, stem=stem, what=what
+    )
 
 
 def interval(ratio: Ratio) -> str:

@@ -28,7 +28,7 @@ from sliceit_drake.systems.agent import AgentConfig, Decide
 from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import load_network
 from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
-from studies.learning.rules import FAST, TUNED, uniform, with_draw
+from studies.learning.rules import TUNED, fast, uniform, with_draw
 from studies.learning.tune_rule import BOUNDS
 from studies.pages import publish, render_and_store
 
@@ -107,7 +107,7 @@ def decider(case: Case) -> tuple[AgentConfig, Decide]:
         agent.rule = rule
     if agent.rule is not None:
         if kind in ("fast rule", "tuned rule"):
-            agent.draw_increment = FAST
+            agent = fast(agent)
         return agent, load_network(agent)
     simulator, _, other = kind.partition(", ")
     folder = resource_path(f"models/policies/{simulator}_{int(number)}")

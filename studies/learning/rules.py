@@ -1,17 +1,23 @@
 """What policies are set beside, through the agent's own actions."""
 
+import dataclasses as dc
+
 import numpy as np
 
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, Decide, observation_names
 from sliceit_drake.systems.agent_rule import AgentRule
 
-__all__ = ["FAST", "TUNED", "uniform", "with_draw"]
+__all__ = ["TUNED", "fast", "uniform", "with_draw"]
 
 DRAW = ACTIONS.index("draw")
 NAMES = observation_names(AgentConfig().history)
-FAST = 7.5e-3
-"""Draw of a decision at 150 mm/s, the limit of the optimised motions, m."""
 PLACE, LAST = NAMES.index("target_x"), NAMES.index("last_draw")
+
+
+def fast(agent: AgentConfig) -> AgentConfig:
+    """An agent that may draw at 150 mm/s, the limit of the optimised motions, and press as the
+    trainings do that correct a rule with such draws."""
+    return dc.replace(agent, draw_increment=7.5e-3, press_increment=6e-3)
 
 
 def with_draw(decide: Decide, rule: AgentRule | None) -> Decide:

@@ -18,18 +18,18 @@ from sliceit_drake.learning.fixed_slices import cut_fixed_slices
 from sliceit_drake.learning.task import TaskConfig
 from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import load_network
-from studies.learning.rules import FAST
+from studies.learning.rules import fast
 
 __all__ = ["BOUNDS", "add_arguments", "run"]
 
 BOUNDS = {
-    "level": (6.0, 40.0),
+    "level": (10.0, 45.0),
     "gain": (0.3, 3.0),
     "reach": (0.3, 0.95),
     "softness": (-1.0, 1.0),
     "landing": (0.03, 1.0),
 }
-START = AgentRule(20.0, landing=0.1)
+START = AgentRule(30.0)
 MEMBERS = 12
 """Candidates of a generation."""
 SLICES, SEED = 9, 2_000_000
@@ -40,13 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
     parser.add_argument("--generations", type=int, default=5, help="after the first; 5")
     parser.add_argument("--seed", type=int, default=0, help="of the search; 0")
-    parser.add_argument(
-        "--draw",
-        metavar="M",
-        type=float,
-        default=FAST,
-        help=f"most that a decision draws, m; {FAST:g}, 150 mm/s",
-    )
     parser.add_argument(
         "--output", metavar="FILE", type=Path, required=True, help=".jsonl, a line a candidate"
     )
@@ -61,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
             known[tuple(row.pop("rule"))] = row
     options.output.parent.mkdir(parents=True, exist_ok=True)
     rule, task = AgentRule(), TaskConfig()
-    task.agent = dc.replace(task.agent, draw_increment=options.draw, rule=rule)
+    task.agent = dc.replace(fast(task.agent), rule=rule)
     env = SlicingEnv(task)
     bar = tqdm(total=MEMBERS * (options.generations + 1), desc="candidates")
 

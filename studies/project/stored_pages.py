@@ -49,9 +49,12 @@ def _whole_pages(docs: Path) -> Iterator[tuple[str, str]]:
     yield "results/benchmarks.md", aims.page(results)
     verified = json.loads((results / "verification.json").read_text(encoding="utf-8"))
     yield "results/verification.md", verification_page(verified)
-    lines = (results / "slicing_evaluation.jsonl").read_text(encoding="utf-8").splitlines()
-    found = comparison.compare([json.loads(line) for line in lines])
-    yield "results/slicing_results.md", comparison.comparison_page(found)
+    rows: list[dict] = []
+    for ours, (stem, _) in comparison.WHOSE.items():
+        lines = (results / f"{stem}_evaluation.jsonl").read_text(encoding="utf-8").splitlines()
+        rows += map(json.loads, lines)
+        found = comparison.compare(rows, ours)
+        yield f"results/{stem}_results.md", comparison.comparison_page(found, ours)
     replicates = results / "coverage.jsonl"
     count = len(replicates.read_text(encoding="utf-8").splitlines())
     problem = coverage.Problem()

@@ -57,6 +57,8 @@ class DecisionRule:
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
             causes of up to this size.
+        size_by_record: The same of an effect that differs from record to record, over the noise
+            alone: no own error does that.
         limit: Level of the intervals of the causes' numbers.
         replicates: Slices of a condition from which variation can be told from an effect.
         presence: Share of the records in which a cause shows that has numbers of its own in each.
@@ -70,6 +72,7 @@ class DecisionRule:
     gain: float = 1.1
     beside: float = 3.0
     size: float = 0.9
+    size_by_record: float = 0.5
     limit: float = 0.1
     replicates: int = 3
     presence: float = 0.4
@@ -287,7 +290,7 @@ def _refusal(
         size = standardised_size(problem, own, np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
-    if e.size < rule.size:
+    if e.size < (rule.size_by_record if e.per_record else rule.size):
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
         return f"shows in {100 * e.presence:.0f} % of the records that could show it"
@@ -409,7 +412,8 @@ def _lasting(
             size = finding.size
         else:
             size = standardised_size(problem, own, np.array(e.coefficients), wrong)
-        if 2.0 * (high - low) <= e.limit or size < rule.size:
+        least = rule.size_by_record if e.per_record else rule.size
+        if 2.0 * (high - low) <= e.limit or size < least:
             left.remove(finding)
     return left
 
