@@ -241,8 +241,9 @@ def _two_slices(policies: Sequence[str]) -> dict[str, list[SliceTrace]]:
     }
 
 
-def comparison_page(found: Sequence[Comparison], ours: str = OURS) -> str:
-    """The page; the paper's ratio stands beside the foods that it cut; `ours` as of `compare`."""
+def comparison_page(found: Sequence[Comparison], whose: str = OURS) -> str:
+    """The page; the paper's ratio stands beside the foods that it cut; `whose` as `ours` of
+    `compare`."""
     rows = []
     for each in found:
         ours, baseline = each.values[OURS], each.values[BASELINE]
@@ -260,7 +261,7 @@ def comparison_page(found: Sequence[Comparison], ours: str = OURS) -> str:
             cells += [means, interval(each.ratios[metric])]
         paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
         rows.append([*cells, interval(each.strict), paper])
-    stem, what = WHOSE[ours]
+    stem, what = WHOSE[whose]
     return render(
         "slicing_results", claim=claim(found), titles=TITLES, rows=rows, stem=stem, what=what
     )
