@@ -59,13 +59,13 @@ def test_where_nothing_was_measured_the_page_says_so_and_names_the_command(tmp_p
             "from",
             ("first_picture_s", 60),
         ),
-        ("diagnosis_speed", {"records": 18.0, "warm_s": 1.0}, "diagnosis of", ("cold_s", 600.0)),
-        ("diagnosis_speed", {"records": 18.0, "cold_s": 1.0}, "the same again,", ("warm_s", 60.0)),
+        ("diagnosis_speed", {"records": 18.0, "warm_s": 1.0}, "diagnosis of", ("cold_s", 90.0)),
+        ("diagnosis_speed", {"records": 18.0, "cold_s": 1.0}, "the same again,", ("warm_s", 15.0)),
         (
             "learning_speed",
             {"spring_2_decisions_a_second": 1.0},
             "80,000",
-            ("cutting_2_decisions_a_second", -80_000 / 2400),
+            ("cutting_2_decisions_a_second", -80_000 / 1200),
         ),
         (
             "learning_speed",

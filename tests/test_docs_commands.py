@@ -134,9 +134,9 @@ TESTED = {
         "sliceit train --output policy",
         "sliceit train --output output/ours --seed 0",
         "sliceit train --output output/baseline --seed 0 --simulator spring",
-        "sliceit train --output output/corrected --steps 20000"
+        "sliceit train --output output/corrected --steps 12000"
         ' --set "{updates: 2, task: {agent: {draw_increment: 7.5e-3,'
-        ' rule: {level: 20.0, landing: 0.1, correction: 1.0}}}}"',
+        ' press_increment: 6.0e-3, rule: {level: 30.0, correction: 0.5}}}}"',
         "sliceit train --output output/draws/cutting_0 --seed 0 --steps 15000"
         ' --set "{task: {agent: {draw_increment: 7.5e-3}}}"',
         "sliceit train --output output/draws/spring_0 --seed 0 --steps 15000 --simulator spring"
@@ -317,7 +317,7 @@ READ_ONLY = {
         python -m studies bench_figures
         python -m studies station_speed --repeat 20 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
-        python -m studies tune_rule --generations 3 --output output/tune_rule.jsonl
+        python -m studies tune_rule --generations 1 --output output/tune_rule.jsonl
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
 }
