@@ -37,5 +37,5 @@ def uniform(rng: np.random.Generator) -> Decide:
     return lambda _: rng.uniform(-1.0, 1.0, len(ACTIONS))
 
 
-TUNED = AgentRule(level=16.87, gain=1.813, reach=0.6022, softness=-0.3975, landing=0.1)
-"""What `python -m studies tune_rule --generations 3` found, drawing at 150 mm/s."""
+TUNED = AgentRule(level=23.43, gain=2.992, reach=0.9375, softness=0.3711, landing=0.6609)
+"""What `python -m studies tune_rule --generations 1` found, drawing at 150 mm/s."""
