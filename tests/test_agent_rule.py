@@ -28,8 +28,11 @@ def test_it_presses_where_it_feels_less_than_its_level_and_gives_way_where_more(
     assert acted(rule, 10.0)[[PRESS, SOFT]] == pytest.approx([0.0, 0.0])
     assert acted(rule, 5.0)[[PRESS, SOFT]] == pytest.approx([0.5, 0.5])
     assert acted(rule, 15.0)[[PRESS, SOFT]] == pytest.approx([-0.5, -0.5])
-    # At the board its level is lower.
-    assert acted(AgentRule(10.0, landing=0.5), 5.0, 0.0)[PRESS] == pytest.approx(0.0)
+    # At the board its level is lower, and where it falls; food that holds it near is pressed on.
+    soft = AgentRule(10.0, landing=0.2, approach=0.0)
+    assert acted(soft, 2.0, 0.0)[PRESS] == pytest.approx(0.0)
+    assert acted(soft, 3.0, 4e-4, speed=0.01)[PRESS] == pytest.approx(0.0)
+    assert acted(soft, 3.0, 4e-4)[PRESS] == pytest.approx(0.5)
     assert (np.abs(acted(rule, 1e3)) <= 1.0).all()
 
 

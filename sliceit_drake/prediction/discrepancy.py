@@ -62,9 +62,6 @@ JITTER = 1e-8
 """Added to the diagonal of what is inverted, relative to it."""
 LESS = 0.5
 """Median before any data of the other sizes, relative to the shared part on the way in."""
-IN_BOARD = 0.1, 0.3
-"""The same of the phase in the board, and the standard deviation of its logarithm: the board is the
-bench's, and is known. Only what food it presses together may be wrong there by itself."""
 
 
 @dc.dataclass(frozen=True)
@@ -332,8 +329,6 @@ class Discrepancy:
         self.spread = np.concatenate(
             [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
         )
-        board = PHASES.index("board") - len(PHASES)
-        less[board], self.spread[board] = np.log(IN_BOARD[0]), IN_BOARD[1]
         self.prior = Sizes(np.log(usual), less[:3], less[3:])
 
     def factor(self, of: Covariates) -> np.ndarray:

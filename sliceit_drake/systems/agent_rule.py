@@ -13,6 +13,9 @@ LANDING = 4e-3
 turns round: the edge goes up and down by a millimetre, and near the board would hit it."""
 CREEP = 5e-3
 """Speed downwards at which it may always be, m/s."""
+STUCK, SETTLED = 0.6, 2e-4
+"""Least fraction of the level where the knife creeps and is this high over the board, m: some foods
+hold it by more than is left of the level there."""
 BRAKE = 200.0
 """Of the press on what is more than the speed that it may have, s/m."""
 
@@ -52,7 +55,10 @@ class AgentRule:
         """
         height = max(height, 0.0)
         near = height / LANDING
-        push = self.gain * (1.0 - force / (self.level * min(1.0, self.landing + near)))
+        left = min(1.0, self.landing + near)
+        if speed < CREEP and height > SETTLED:
+            left = max(left, STUCK)
+        push = self.gain * (1.0 - force / (self.level * left))
         softness, draw = self.softness + push, self.draw(place, way) * min(1.0, self.calm + near)
         if self.approach > 0.0:
             push -= BRAKE * max(speed - CREEP - height / self.approach, 0.0)

@@ -71,7 +71,7 @@ class DecisionRule:
     alarm: float = 0.02
     gain: float = 1.1
     beside: float = 3.0
-    size: float = 0.8
+    size: float = 0.9
     size_by_record: float = 0.5
     limit: float = 0.1
     replicates: int = 3
