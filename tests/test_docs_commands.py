@@ -153,7 +153,7 @@ TESTED = {
         " --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/{cutting,spring}_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/results/slicing_evaluation.jsonl",
-        "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e4 3e3 3e5"
+        "sliceit evaluate models/policies/corrected_[0-4]"
         " --output docs/results/corrected_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [

@@ -57,6 +57,8 @@ LEVELS = {
     "fast rule": (6.0, 9.0, 14.0, 20.0, 30.0, 45.0),
 }
 """Forces that presses and rules keep to, N: each is a point of a front."""
+SLIGHT = 1.0
+"""What forces below are compared as, N: some rules hardly touch the board."""
 TIMES, FORCES = (2, 3, 5, 10, 20), (2, 5, 10, 20, 50)
 """Marks of the figure's axes, s and N."""
 KINDS = {
@@ -193,9 +195,9 @@ def over_rule(
     done = sorted((p["duration"], p[metric]) for p in rule if p["completed"] == 1.0)
     if not done:
         return []
-    times, forces = np.array(done).T
+    times, forces = np.maximum(np.array(done), [0.0, SLIGHT]).T
     return [
-        each[metric]
+        max(each[metric], SLIGHT)
         / float(np.exp(np.interp(np.log(each["duration"]), np.log(times), np.log(forces))))
         for each in policies
         if each["completed"] == 1.0 and times[0] <= each["duration"] <= times[-1]
