@@ -155,6 +155,8 @@ TESTED = {
         " --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/corrected_[0-4]"
         " --output docs/results/corrected_evaluation.jsonl",
+        "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e3 3e5"
+        " --output docs/results/corrected_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
         "sliceit simulate cucumber_agent",
