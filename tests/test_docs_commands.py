@@ -280,7 +280,9 @@ READ_ONLY = {
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 5
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 6
+        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 3
         python -m studies bench_score FOLDER --keep docs/results/benches_report.jsonl
+        python -m studies bench_score docs/results/benches_report.jsonl
         python -m studies half_depth --output docs/figures/half_depth.png
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
