@@ -170,6 +170,20 @@ def test_a_jump_that_replicates_share_is_no_slip(shared):
         assert np.median(e.by_record) == pytest.approx(1.5, rel=0.15)
 
 
+def test_what_differs_from_record_to_record_is_asked_for_less_of_the_noise():
+    found = problem(43).found
+    hum = Column("cause", "hum", "wave", per_record=True)
+    for k, r in enumerate(found.records):
+        wave = np.sin(2.0 * np.pi * 12.0 * r.time)[:, None]
+        columns = np.concatenate([r.columns, wave[:, :, None]], axis=2)
+        measured, even = r.measured + 0.07 * (-1) ** k * wave, np.zeros_like(columns)
+        found.records[k] = dc.replace(r, columns=columns, measured=measured, even=even)
+    whole = LinearProblem(Sensitivities([*found.columns, hum], found.records))
+    assert reach_verdict(whole, 60).names == [["hum"]]
+    strict = DecisionRule(size_by_record=DecisionRule.size)
+    assert reach_verdict(whole, 60, rule=strict).names == []
+
+
 def test_what_no_cause_explains_is_unknown():
     assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
 

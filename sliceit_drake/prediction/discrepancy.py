@@ -326,10 +326,10 @@ class Discrepancy:
         self.factors = [self.factor(c) for c in covariates]
         phases = len(PHASES) - 1
         less = np.log(np.full(3 + phases, LESS))
+        self.prior = Sizes(np.log(usual), less[:3], less[3:])
         self.spread = np.concatenate(
             [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
         )
-        self.prior = Sizes(np.log(usual), less[:3], less[3:])
 
     def factor(self, of: Covariates) -> np.ndarray:
         """By which the parts of a condition's discrepancy count, but for its own [3]."""

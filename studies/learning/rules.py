@@ -38,4 +38,5 @@ def uniform(rng: np.random.Generator) -> Decide:
 
 
 TUNED = AgentRule(level=23.43, gain=2.992, reach=0.9375, softness=0.3711, landing=0.6609)
-"""What `python -m studies tune_rule --generations 1` found, drawing at 150 mm/s."""
+"""What `python -m studies tune_rule --generations 1` found, drawing at 150 mm/s, before the
+rule pressed on where food holds the knife near the board."""

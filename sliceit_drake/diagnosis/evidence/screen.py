@@ -218,10 +218,8 @@ class _Statistics:
         and their gains [R]; 0 where a record knows nothing of them."""
         alone = self.problem.found.columns[columns[0]].alone
         reduced = (self.problem.apart if alone else self.problem).reduced(self.model)
-        out, (explained, gains) = (
-            np.zeros((len(reduced), len(columns))),
-            np.zeros((2, len(reduced))),
-        )
+        out = np.zeros((len(reduced), len(columns)))
+        explained, gains = np.zeros((2, len(reduced)))
         for r, A in enumerate(reduced):
             inner, b = A[np.ix_(columns, columns)], A[columns, -1]
             if np.diag(inner).min() > 1e-9:

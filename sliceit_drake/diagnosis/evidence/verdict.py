@@ -80,6 +80,10 @@ class DecisionRule:
     trend: float = 0.4
     most: int = 3
 
+    def least_size(self, e: CauseEvidence) -> float:
+        """Of a cause that is named."""
+        return self.size_by_record if e.per_record else self.size
+
 
 @dc.dataclass
 class Finding:
@@ -187,15 +191,18 @@ def reach_verdict(
         screenings.append(screening)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             break
-        best, bounded = None, []
+        best, bounded, beside_it = None, [], {}
         for e in sorted(screening.causes, key=lambda e: -e.gain):
             why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
             if why and why == _at_bound(e):
                 bounded.append(e)
             for other in bounded if not why else ():
                 # What gains less than a cause that is refused may only stand for it.
-                assumed_too = [*assumed, other.cause]
-                again = screen(problem, replicates, seed + len(findings), assumed_too)
+                if other.name not in beside_it:
+                    assumed_too = [*assumed, other.cause]
+                    found = screen(problem, replicates, seed + len(findings), assumed_too)
+                    beside_it[other.name] = found
+                again = beside_it[other.name]
                 why = _refusal(problem, again, again.evidence(e.name), rule)
                 if why:
                     why = f"{why}, beside {other.name}, whose {_at_bound(other)}"
@@ -290,7 +297,7 @@ def _refusal(
         size = standardised_size(problem, own, np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
-    if e.size < (rule.size_by_record if e.per_record else rule.size):
+    if e.size < rule.least_size(e):
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
         return f"shows in {100 * e.presence:.0f} % of the records that could show it"
@@ -412,8 +419,7 @@ def _lasting(
             size = finding.size
         else:
             size = standardised_size(problem, own, np.array(e.coefficients), wrong)
-        least = rule.size_by_record if e.per_record else rule.size
-        if 2.0 * (high - low) <= e.limit or size < least:
+        if 2.0 * (high - low) <= e.limit or size < rule.least_size(e):
             left.remove(finding)
     return left
 
