@@ -199,12 +199,13 @@ def test_neighbours_share_their_error_in_each_channel():
 
 
 def test_a_channel_without_force_has_a_band_as_wide_as_its_noise():
-    model, rng = ThreeChannels(3), np.random.default_rng(6)
+    # Of few records the air does not tell whether a zero is left.
+    model, rng = ThreeChannels(9), np.random.default_rng(6)
     noise = np.where(model.channel == 2, 0.8, 0.05)
     model.measured = model.measured + noise * rng.normal(size=len(noise))
-    model.used = model.record_of < 2
+    model.used = model.record_of < 8
     inside, width = model.inside()
-    other = (model.record_of == 2) & (model.channel < 2)
+    other = (model.record_of == 8) & (model.channel < 2)
     assert width[other].mean() == pytest.approx(2.0 * 1.645 * 0.05, rel=0.15)
     assert inside[other].mean() == pytest.approx(0.9, abs=0.04)
 
@@ -232,3 +233,22 @@ def test_a_press_tells_nothing_of_what_a_draw_changes():
         draw = (model.record_of == 2) & (model.depth > 0.3 * HEIGHT)
         shares += [inside[draw & (model.channel == c)].mean() for c in (1, 2)]
     assert np.mean(shares) > 0.85
+
+
+def test_a_zero_of_each_record_widens_the_band_of_another_by_what_the_air_shows():
+    rng, widths, shares = np.random.default_rng(9), [], []
+    for _ in range(24):
+        model = ThreeChannels(4)
+        noise = 0.02 * rng.normal(size=len(model.measured))
+        zeros = 0.2 * rng.normal(size=(4, 3))
+        # Once without them.
+        for size in (0.0, 1.0):
+            model.measured = model.columns @ [0.5, 0.5] + noise
+            model.measured = model.measured + size * zeros[model.record_of, model.channel]
+            model.used = model.record_of < 3
+            inside, width = model.inside()
+            other = (model.record_of == 3) & (model.channel < 2)
+            widths.append(width[other].mean())
+        shares.append(inside[other].mean())
+    assert np.mean(widths[::2]) < 0.08
+    assert 0.8 < np.mean(shares) < 0.98

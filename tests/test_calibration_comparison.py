@@ -44,7 +44,7 @@ def test_its_table_and_its_figure_have_both_bands(tmp_path):
     record = SimpleNamespace(metadata=SimpleNamespace(motion=SimpleNamespace(speed=0.02)))
     target = SimpleNamespace(record=record, model=SimpleNamespace(point_nodes=[0] * 61))
     predictor = SimpleNamespace(targets=[target], setup=SimpleNamespace(oscillation=None))
-    bands = [ForceBand(force, np.full(50, d)) for d in (0.1, 1.0)]
+    bands = [ForceBand(force[None], np.full(50, d), np.ones(1)) for d in (0.1, 1.0)]
     errors = dict.fromkeys(("rms", "search_rms", "refined_rms", "held_out_rms"), 0.2)
     ours = SimpleNamespace(predictor=predictor, unit=np.zeros(4), band=bands[0], **errors)
     rows = [Row(n, time, force + 0.2, 0.0, 0.2, 10.2, 0.1) for n in ("DiSECt", "spring", "ours")]

@@ -1,21 +1,23 @@
 """Bands of predicted force: what parameters, noise and the simulation's own error leave open.
 
 A record's force is the simulated one, plus what the parameters may change of it, plus what the
-simulation gets wrong by itself (`prediction.discrepancy`), plus what slices differ by, plus noise.
+simulation gets wrong by itself (`prediction.discrepancy`), plus what slices differ by, plus the
+sensor's zero, plus noise.
 All are normal, and their sizes are those of the records that were fitted. Where nothing was fitted,
 deeper or at another speed, parameters and discrepancy are what they were before. Height and speed
 of a record that was not fitted are as far from those that were as these are apart.
 
 What the simulation gets wrong is a part of the force that it predicts, in each channel: a press
 tells how wrong it is, but nothing of the force along the edge, which only a draw has. Slices differ
-by a factor. Noise is what is left, in each channel and phase of the motion.
+by a factor, and records by the zero that is left in each channel, as their air shows. Noise is what
+is left, in each channel and phase of the motion.
 """
 
 import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri, stdtrit
 
 from sliceit_drake.calibration.gauss_newton import PRIOR_CENTER, PRIOR_VARIANCE
 from sliceit_drake.calibration.prediction import Predictor
@@ -34,14 +36,20 @@ __all__ = ["ForceBand", "force_band", "independent"]
 
 WIDER = 1.5
 """Spread of the drawn places over that of the linear problem."""
+BISECTIONS = 40
+"""Of an end of a band."""
 ROUNDS = 3
 """Alternations of the noise and the sizes of the discrepancy."""
 LEAST = 1e-3
 """Least standard deviation of the noise, relative to the root mean square force."""
 USUAL = 0.9
-"""Share of what is left that tells the noise."""
+"""Share of what is left that tells the noise, and of zeros that are within what few tell."""
 APART = 0.1
 """Standard deviation of the factors by which slices differ before any data: vegetables are so."""
+KNOWN = 3
+"""Degrees of freedom of that standard deviation: so many more slices would tell as much."""
+AIR = 6
+"""Least rows in the air that tell a record's zero."""
 UNSEEN = (0.0, 0.1, 0.3)
 """Least sizes of the discrepancy's shared parts: what a decade of the speed and a draw change of
 the force, as a part of it, where no record tells."""
@@ -49,20 +57,40 @@ the force, as a part of it, where no record tells."""
 
 @dc.dataclass
 class ForceBand:
-    """Predicted force of records, as normal distributions.
+    """Predicted force of records, as normal distributions about slices that may be the right one.
 
     Attributes:
-        mean: Of each entry of the predictor's `measured` [M], N.
-        deviation: Standard deviation of a measurement [M], N, noise included.
+        means: Of each slice, and each entry of the predictor's `measured` [D, M], N.
+        deviation: Standard deviation of a measurement about it [M], N, noise included.
+        shares: Probabilities of the slices [D].
     """
 
-    mean: np.ndarray
+    means: np.ndarray
     deviation: np.ndarray
+    shares: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of each measurement [M], N."""
+        return np.asarray(self.shares @ self.means)
 
     def interval(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Ends of the band that holds each measurement with a probability `level`, each [M], N."""
-        reach = float(ndtri(0.5 + level / 2.0)) * self.deviation
-        return self.mean - reach, self.mean + reach
+        """Ends of the band that holds each measurement with a probability `level`, each [M], N.
+
+        As much lies below the band as above it.
+        """
+        low, high = (self._quantile(0.5 + side * level / 2.0) for side in (-1.0, 1.0))
+        return low, high
+
+    def _quantile(self, probability: float) -> np.ndarray:
+        """Force that a measurement stays below with a probability [M], N."""
+        reach = float(ndtri(probability)) * self.deviation
+        low, high = self.means.min(0) + reach, self.means.max(0) + reach
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            below = self.shares @ ndtr((middle - self.means) / self.deviation) < probability
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return 0.5 * (low + high)
 
 
 def independent(model: Predictor, residuals: np.ndarray) -> EvenNoise:
@@ -89,10 +117,10 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
     force, r = model.measured + residuals, -residuals
     conditions, groups = _conditions(model), _groups(model)
     known = [c for c in conditions if (c.rows & used).any()]
-    slices = _slices(model, force, r, known)
+    own = np.column_stack([_slices(model, force, r, known), _zeros(model, r)])
     Z, phase = _shapes(model, force)
-    z, n = Z.shape[1], d + slices.shape[1]
-    columns = np.column_stack([Z, J, slices, r])
+    z, n = Z.shape[1], d + own.shape[1]
+    columns = np.column_stack([Z, J, own, r])
     total = n + (3 + len(conditions)) * z
     center, precision = np.zeros(total), np.ones(total)
     center[:d], precision[:d] = PRIOR_CENTER - unit, 1.0 / PRIOR_VARIANCE
@@ -111,7 +139,7 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
         for rows in (c.rows & used for c in known):
             grams.append((weight[rows, None] * columns[rows]).T @ columns[rows])
         sizes, _ = problem.fit(grams, range(n), precision[:n])
-        A = np.column_stack([J, slices, _parts(problem, sizes, conditions, Z)])
+        A = np.column_stack([J, own, _parts(problem, sizes, conditions, Z)])
         mean, _ = _posterior(A[used], r[used], weight[used], center, precision)
         rest = r - A @ mean
     weight, variance = _weight(model, rest, groups), _variance(model, rest, groups)
@@ -121,12 +149,13 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
     mean, covariance = _posterior(A[used], r[used], weight[used], center, precision)
     if draws:
         normal = mean[:d], covariance[:d, :d]
-        forces, spread = _drawn(
+        means, spread, shares = _drawn(
             model, unit, draws, normal, A[:, d:], weight[used], middle, precision[:d]
         )
-        return ForceBand(forces, np.sqrt(spread + variance))
+        return ForceBand(means, np.sqrt(spread + variance), shares)
     spread = np.einsum("ij,jk,ik->i", A, covariance, A)
-    return ForceBand(force + A @ mean, np.sqrt(np.maximum(spread, 0.0) + variance))
+    deviation = np.sqrt(np.maximum(spread, 0.0) + variance)
+    return ForceBand((force + A @ mean)[None], deviation, np.ones(1))
 
 
 def _like_the_fitted(
@@ -167,8 +196,9 @@ def _drawn(
     weight: np.ndarray,
     center: np.ndarray,
     precision: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of the entries [M] without noise, from slices at drawn places.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries [D, M] of slices at drawn places, variance without noise about each [M], and shares
+    [D].
 
     Args:
         normal: Mean and covariance of the places from `unit`, as the linear problem has them.
@@ -194,10 +224,8 @@ def _drawn(
     prior = (places - center) ** 2 @ precision
     logs = -0.5 * (fit + prior - (steps**2).sum(1))
     shares = _shares(logs)
-    means = forces + found @ C.T
-    mean = shares @ means
     within = np.einsum("ij,jk,ik->i", C, inner, C)
-    return mean, shares @ (means - mean) ** 2 + within
+    return forces + found @ C.T, within, shares
 
 
 def _shares(logs: np.ndarray) -> np.ndarray:
@@ -272,7 +300,7 @@ def _slices(
         r: Measured less predicted force [M], N.
         known: Conditions that were fitted.
     """
-    square, degrees = APART**2, 1
+    square, degrees = KNOWN * APART**2, KNOWN
     for rows in (c.rows & model.used for c in known):
         records = [rows & (model.record_of == k) for k in np.unique(model.record_of[rows])]
         factors = [
@@ -282,6 +310,30 @@ def _slices(
         degrees += len(records) - 1
     apart = np.sqrt(square / degrees)
     return apart * force[:, None] * (model.record_of[:, None] == np.arange(len(model.targets)))
+
+
+def _zeros(model: Predictor, r: np.ndarray) -> np.ndarray:
+    """By which a zero in each channel of each record changes the entries [M, channels * records],
+    in standard deviations of the zeros that the air shows.
+
+    Args:
+        model: Entries that it uses show zeros.
+        r: Measured less predicted force [M], N.
+    """
+    channel, records = _channel(model), range(len(model.targets))
+    air = model.used & (model.depth <= 0.0)
+    columns = []
+    for c in np.unique(channel):
+        shown = [r[air & (channel == c) & (model.record_of == k)] for k in records]
+        # Less what the mean of so many rows of noise is away from zero by itself.
+        squares = [x.mean() ** 2 - x.var(ddof=1) / len(x) for x in shown if len(x) >= AIR]
+        size = 0.0
+        if squares:
+            # Few records hardly tell it: nine of ten others are as near as Student's t says.
+            few = stdtrit(len(squares), 0.5 + USUAL / 2.0) / ndtri(0.5 + USUAL / 2.0)
+            size = few * np.sqrt(max(0.0, float(np.mean(squares))))
+        columns += [size * ((channel == c) & (model.record_of == k)) for k in records]
+    return np.column_stack(columns)
 
 
 def _parts(

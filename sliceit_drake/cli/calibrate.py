@@ -7,6 +7,7 @@ refines the best places with Adam on the exact gradient. Without --food the reco
 and size. Writes to DIR:
   food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`
   calibration.json  errors by stage, held-out errors, parameters
+  first_fit.png     a fit on a coarse mesh, after a few seconds: do record and setup go together?
   fit.png           measured and predicted force
   structure.json    what was compared, and setup.yaml, the setup with what was taken
   points.csv        with --per-point: factors of the cut points' toughness
@@ -178,6 +179,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     import sys
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
+    from sliceit_drake.calibration.first_fit import first_fit
     from sliceit_drake.calibration.setup import load_setup, setup_of_record
     from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.calibration.structure import choice_in, puncture_lines
@@ -204,6 +206,13 @@ def _calibrate(options: argparse.Namespace) -> int:
     fitted = [r for r in records if r.name not in options.hold_out]
     start = values_of(load_calibrated_food(options.start)) if options.start else None
     warnings: list[str] = []
+    if start is None:
+        with StageBars() as bars:
+            first = first_fit(
+                setup, fitted, options.workers, lambda done, all: bars.show("first fit", done, all)
+            )
+        first.save(options.output / "first_fit.png")
+        print(f"First fit, on a coarse mesh: {first.rms:.3f} N, {options.output}/first_fit.png")
     if options.structure == "choose":
         with StageBars() as bars:
             choice = choice_in(

@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sliceit_drake.calibration.bands import force_band, independent
-from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
+from sliceit_drake.calibration.bands import force_band
+from sliceit_drake.calibration.first_fit import fit_from_starts
+from sliceit_drake.calibration.gauss_newton import residuals_at
 from sliceit_drake.calibration.setup import setup_of_record
-from sliceit_drake.calibration.structure import coarse_predictor, first_starts
+from sliceit_drake.calibration.structure import coarse_predictor
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.records.slice_record import SliceRecord
 from studies.benches.draw import LAWS, PARTS, RESERVED, Draw, seed_of
@@ -32,8 +33,6 @@ from studies.pages import percent, publish, table
 __all__ = ["Row", "add_arguments", "interval_score", "run", "scored"]
 
 LEVEL = 0.9
-STEPS = 6
-"""Of each fit."""
 DRAWS = 32
 """Slices of each band."""
 KINDS = ("same speed", "other speeds", "draws")
@@ -83,18 +82,7 @@ def scored(part: str, law: str, number: int) -> list[Row]:
     fitted, left = _chosen(draw.records())
     setup = setup_of_record(fitted[0])
     few = coarse_predictor(setup, fitted, 1)
-    fits = []
-    for start in first_starts(few):
-        unit = np.array([p.unit(start[p.name]) for p in few.parameters])
-        try:
-            fits.append(gauss_newton(few, unit, steps=STEPS))
-        except CuttingError:
-            continue
-    if not fits:
-        raise CuttingError("no start leads to a fit")
-    best = min(fits, key=lambda fit: fit.cost).unit
-    noise = independent(few, *residuals_at(few, [best]))
-    found = few.values(gauss_newton(few, best, noise=noise, steps=STEPS).unit)
+    found = few.values(fit_from_starts(few))
     # What is each record's own is unknown of those that were not fitted.
     predictor = coarse_predictor(setup, [*fitted, *(record for _, record in left)], 1)
     model = predictor.holding_out(predictor.record_of >= len(fitted))

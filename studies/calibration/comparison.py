@@ -224,7 +224,7 @@ def left_out_band(model: Predictor, unit: np.ndarray, blocks: int = BLOCKS) -> F
         band = force_band(model.holding_out(block == k), unit)
         mean[block == k] = band.mean[block == k]
         deviation[block == k] = band.deviation[block == k]
-    return ForceBand(mean, deviation)
+    return ForceBand(mean[None], deviation, np.ones(1))
 
 
 def _best_shift(

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.calibration.bands import ForceBand, force_band, independent
-from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
+from sliceit_drake.calibration.bands import ForceBand, force_band
+from sliceit_drake.calibration.first_fit import fit_from_starts
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import load_setup
-from sliceit_drake.calibration.structure import coarse_predictor, first_starts
+from sliceit_drake.calibration.structure import coarse_predictor
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
@@ -24,8 +24,6 @@ from studies.figures import BLUE, ORANGE, new_figure, tidy
 __all__ = ["HalfDepth", "add_arguments", "half_depth", "run"]
 
 FOODS = ("cucumber", "tomato", "potato")
-STEPS = 6
-"""Of each fit."""
 DRAWS = 32
 """Slices of each band."""
 
@@ -64,14 +62,7 @@ def half_depth(predictor: Predictor) -> HalfDepth:
     """Fits what lies above half of the food's height."""
     lower = predictor.depth > 0.5 * predictor.targets[0].facts.height
     upper = predictor.holding_out(lower)
-    fits = []
-    for start in first_starts(predictor):
-        unit = np.array([p.unit(start[p.name]) for p in predictor.parameters])
-        fits.append(gauss_newton(upper, unit, steps=STEPS))
-    best = min(fits, key=lambda fit: fit.cost)
-    # Half a record hardly tells some parameters: these stay near the middle of their ranges.
-    noise = independent(upper, *residuals_at(upper, [best.unit]))
-    unit = gauss_newton(upper, best.unit, noise=noise, steps=STEPS).unit
+    unit = fit_from_starts(upper)
     (row,) = predictor.predict([unit])
     fitted = np.concatenate([p.predicted.ravel() for p in row])
     band = force_band(upper, unit, DRAWS)

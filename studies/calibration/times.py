@@ -1,4 +1,4 @@
-"""How long a calibration takes: a first fit with a picture, and the full one.
+"""How long a calibration takes: until the picture of its first fit is there, and until its end.
 
 For each food that ships the command is typed as a user would, one after the other: on its record,
 or from published levels where there is none. Processor time is that of the command and its
@@ -9,7 +9,6 @@ import argparse
 import dataclasses as dc
 import json
 import resource
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -23,13 +22,11 @@ from sliceit_drake.resources import resource_path
 from studies.pages import publish, table
 from studies.results import describe_machine
 
-__all__ = ["Typed", "add_arguments", "commands_for", "run", "typed"]
+__all__ = ["Typed", "add_arguments", "command_for", "run", "typed"]
 
 FOODS = ("cucumber", "tomato", "potato", "apple", "carrot")
-FIRST = ("--structure", "setup", "--trials", "4", "--steps", "0", "--starts", "1", "--blocks", "0")
-"""Options of a first fit: the setup's values, three more places, and the best of them polished."""
-LIMITS = {"first fit": 60.0, "full": 300.0}
-"""Aims for the wall time on two cores, s."""
+FIRST_LIMIT, LIMIT = 60.0, 300.0
+"""Aims for the wall time on two cores: to the first picture, and in all, s."""
 
 
 @dc.dataclass(frozen=True)
@@ -37,23 +34,22 @@ class Typed:
     """A command that was run.
 
     Attributes:
+        first: Time until the picture of a first fit was there, s; None without a record.
         wall, processor: Time that it took, s.
         rms: Error of its fit, N; None without a record.
-        picture: Whether it left one.
     """
 
+    first: float | None
     wall: float
     processor: float
     rms: float | None
-    picture: bool
 
 
-def commands_for(food: str) -> dict[str, list[str]]:
-    """Arguments of `sliceit` for a food, by the stage that they are for."""
-    if not (resource_path("calibration/records") / f"{food}.csv").exists():
-        return {"full": ["calibrate", "--food", food, "--literature"]}
-    full = ["calibrate", f"calibration/records/{food}.csv", "--food", food]
-    return {"first fit": [*full, *FIRST], "full": full}
+def command_for(food: str) -> list[str]:
+    """Arguments of `sliceit` for a food."""
+    if (resource_path("calibration/records") / f"{food}.csv").exists():
+        return ["calibrate", f"calibration/records/{food}.csv", "--food", food]
+    return ["calibrate", "--food", food, "--literature"]
 
 
 def typed(words: Sequence[str]) -> Typed:
@@ -64,12 +60,13 @@ def typed(words: Sequence[str]) -> Typed:
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "sliceit_drake.cli.main", *words, "--output", folder]
-        begin, before = time.monotonic(), _children()
+        begin, before = time.time(), _children()
         subprocess.run(command, check=True, capture_output=True)
-        wall, processor = time.monotonic() - begin, _children() - before
-        file = Path(folder) / "calibration.json"
+        wall, processor = time.time() - begin, _children() - before
+        file, picture = (Path(folder) / name for name in ("calibration.json", "first_fit.png"))
         rms = json.loads(file.read_text(encoding="utf-8"))["rms_N"] if file.exists() else None
-        return Typed(wall, processor, rms, (Path(folder) / "fit.png").exists())
+        first = picture.stat().st_mtime - begin if picture.exists() else None
+        return Typed(first, wall, processor, rms)
 
 
 def _children() -> float:
@@ -86,19 +83,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    todo = [(f, stage, w) for f in options.foods for stage, w in commands_for(f).items()]
     rows, late = [], False
-    for food, stage, words in tqdm(todo, desc="commands"):
-        found = typed(words)
-        late |= found.wall > LIMITS[stage]
+    for food in tqdm(options.foods, desc="commands"):
+        found = typed(command_for(food))
+        late |= found.wall > LIMIT or (found.first or 0.0) > FIRST_LIMIT
+        first = "" if found.first is None else f"{found.first:.0f}"
         rms = "" if found.rms is None else f"{found.rms:.2f}"
-        times = (f"{found.wall:.0f}", f"{found.processor:.0f}", f"{LIMITS[stage]:.0f}")
-        picture = "yes" if found.picture else "no"
-        rows.append((food, stage, *times, rms, picture))
+        rows.append((food, first, f"{found.wall:.0f}", f"{found.processor:.0f}", rms))
         tqdm.write(", ".join(rows[-1]))
-    titles = "food | stage | wall [s] | processor [s] | aim [s] | RMS error [N] | picture"
-    machine = describe_machine()
-    page = HEAD.format(command=options.command, machine=machine, first=shlex.join(FIRST))
+    titles = "food | first picture [s] | in all [s] | processor [s] | RMS error [N]"
+    page = HEAD.format(command=options.command, machine=describe_machine())
     publish(f"{page}\n{table(titles, rows)}", options.output)
     return int(late)
 
@@ -106,14 +100,13 @@ def run(options: argparse.Namespace) -> int:
 HEAD = """\
 # How long a calibration takes
 
-For who wants to calibrate a food: how long the command takes for each food that ships. The first
-fit polishes the best of four places of the setup's ranges, and draws it:
+For who wants to calibrate a food: how long the command takes for each food that ships, and after
+how long it has drawn its first fit.
 
-    sliceit calibrate calibration/records/NAME.csv --food NAME --output DIR {first}
+    sliceit calibrate calibration/records/NAME.csv --food NAME --output DIR
 
-The full one is the same without the options from `--structure` on. Foods that nobody recorded come
-from published levels, by `--literature`. The aims are wall times on two cores that do nothing else;
-the processor time hardly depends on other work.
+Foods that nobody recorded come from published levels, by `--literature`. The aims are 60 s and 300 s,
+as wall times on two cores that do nothing else; the processor time hardly depends on other work.
 
 {machine}.
 
