@@ -122,11 +122,11 @@ def test_two_hidden_causes_are_both_named():
     assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
 
 
-def bounded(stands_for_rate: bool) -> LinearProblem:
+def bounded(stands_for_rate: bool, rate: float = 2.5, skin: float = 2.5) -> LinearProblem:
     """A rate that is beyond its range, and a skin that acts as a part of it does, or is there."""
-    found = problem(31, rate=2.5, skin=0.0 if stands_for_rate else 2.5).found
+    found = problem(31, rate=rate, skin=0.0 if stands_for_rate else skin).found
     names = [c.name for c in found.columns]
-    rate, skin = names.index("rate"), names.index("skin")
+    of_rate, of_skin = names.index("rate"), names.index("skin")
     range_of = {"rate": {"low": -0.1, "high": 0.1}, "skin": {"one_sided": False}}
     columns = [
         dc.replace(c, **range_of.get(c.name, {})) for c in found.columns if c.name != "skin_like"
@@ -136,7 +136,7 @@ def bounded(stands_for_rate: bool) -> LinearProblem:
     for r in found.records:
         values = r.columns.copy()
         if stands_for_rate:
-            values[:, :, skin] = values[:, :, rate] * (0.9 + 0.1 * (r.time < 1.0))[:, None]
+            values[:, :, of_skin] = values[:, :, of_rate] * (0.9 + 0.1 * (r.time < 1.0))[:, None]
         records.append(dc.replace(r, columns=values[:, :, kept], even=r.even[:, :, kept]))
     return LinearProblem(Sensitivities(columns, records))
 
@@ -151,6 +151,14 @@ def test_a_cause_that_stands_for_one_at_its_bound_is_not_named():
 
 def test_a_cause_is_named_beside_one_at_its_bound_where_it_gains_by_itself():
     assert reach_verdict(bounded(False), 60).names == [["skin"]]
+
+
+def test_what_a_cause_at_its_bound_does_is_no_own_error_that_hides_another():
+    problem = bounded(False, rate=12.0, skin=0.9)
+    assert reach_verdict(problem, 60).names == [["skin"]]
+    # Over all that the rate does the skin is next to nothing.
+    alone = screen(problem, 60).evidence("skin")
+    assert alone.size < 0.1 and alone.gain > alone.limit
 
 
 @pytest.mark.parametrize("shared", [True, False])

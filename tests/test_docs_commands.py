@@ -264,7 +264,6 @@ READ_ONLY = {
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
         sliceit calibrate --food carrot --literature --output DIR
-        sliceit calibrate calibration/records/NAME.csv --food NAME --output DIR --structure setup --trials 4 --steps 0 --starts 1 --blocks 0
         sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
         sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
         """,  # noqa: E501

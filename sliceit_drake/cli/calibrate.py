@@ -211,6 +211,7 @@ def _calibrate(options: argparse.Namespace) -> int:
             first = first_fit(
                 setup, fitted, options.workers, lambda done, all: bars.show("first fit", done, all)
             )
+        options.output.mkdir(parents=True, exist_ok=True)
         first.save(options.output / "first_fit.png")
         print(f"First fit, on a coarse mesh: {first.rms:.3f} N, {options.output}/first_fit.png")
     if options.structure == "choose":

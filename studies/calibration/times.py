@@ -105,8 +105,9 @@ how long it has drawn its first fit.
 
     sliceit calibrate calibration/records/NAME.csv --food NAME --output DIR
 
-Foods that nobody recorded come from published levels, by `--literature`. The aims are 60 s and 300 s,
-as wall times on two cores that do nothing else; the processor time hardly depends on other work.
+Foods that nobody recorded come from published levels, by `--literature`. The aims are 60 s and
+300 s, as wall times on two cores that do nothing else; the processor time hardly depends on other
+work.
 
 {machine}.
 

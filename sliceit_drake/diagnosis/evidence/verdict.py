@@ -184,42 +184,39 @@ def reach_verdict(
     needed = rule.replicates - max(counts) if max(counts) < rule.replicates else 0
     findings: list[Finding] = []
     screenings: list[Screening] = []
+    judged: list[Screening] = []
     refused: dict[str, str] = {}
+    # What would be named but for its bounds: others are judged beside it, and may not stand for it.
+    aside: list[CauseEvidence] = []
     while True:
-        assumed = [f.evidence.cause for f in findings]
+        assumed = [e.cause for e in (*(f.evidence for f in findings), *aside)]
         screening = screen(problem, replicates, seed + len(findings), assumed, progress)
         screenings.append(screening)
+        # Beside what is only set aside nothing is excluded.
+        judged += [] if aside else [screening]
+        beside_it = "".join(f", beside {o.name}, whose {_at_bound(o)}" for o in aside)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
+            if aside:
+                why = f"gains no more than chance gives{beside_it}"
+                refused = dict.fromkeys((e.name for e in screening.causes), why) | refused
             break
-        best, bounded, beside_it = None, [], {}
         for e in sorted(screening.causes, key=lambda e: -e.gain):
             why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
-            if why and why == _at_bound(e):
-                bounded.append(e)
-            for other in bounded if not why else ():
-                # What gains less than a cause that is refused may only stand for it.
-                if other.name not in beside_it:
-                    assumed_too = [*assumed, other.cause]
-                    found = screen(problem, replicates, seed + len(findings), assumed_too)
-                    beside_it[other.name] = found
-                again = beside_it[other.name]
-                why = _refusal(problem, again, again.evidence(e.name), rule)
-                if why:
-                    why = f"{why}, beside {other.name}, whose {_at_bound(other)}"
-                    break
             if not why:
-                best = e
+                findings.append(Finding(e, e.size, e.share, _others(problem, screening, e)))
                 break
-            refused[e.name] = why
-        if best is None:
+            refused[e.name] = f"{why}{beside_it}"
+            if why == _at_bound(e):
+                aside.append(e)
+                break
+        else:
             break
-        findings.append(Finding(best, best.size, best.share, _others(problem, screening, best)))
     if len(findings) > 1:
-        findings = _lasting(problem, findings, rule)
+        findings = _lasting(problem, findings, [e.cause for e in aside], rule)
     named = bool(findings)
     named_causes = [f.evidence.cause for f in findings]
     wrong, misfit, mostly = _own_error(OwnError.beside(problem, named_causes))
-    causes = _verdicts(screenings, findings, refused, rule)
+    causes = _verdicts(judged, findings, refused, rule)
     shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
     if not named and misfit >= rule.unknown and mostly[0][1:3] == ("in", "shared"):
         findings = _nearest(problem, screenings[0])
@@ -403,14 +400,18 @@ def _nearest(problem: LinearProblem, screening: Screening) -> list[Finding]:
 
 
 def _lasting(
-    problem: LinearProblem, findings: Sequence[Finding], rule: DecisionRule
+    problem: LinearProblem,
+    findings: Sequence[Finding],
+    aside: Sequence[CauseAtScan],
+    rule: DecisionRule,
 ) -> list[Finding]:
-    """Findings that still gain beside those after them: what was named first may only have stood
-    for what was named later."""
+    """Findings that still gain beside those after them, and beside what was set aside: what was
+    named first may only have stood for what was named later."""
     left = list(findings)
     for finding in findings[:-1]:
         e = finding.evidence
-        others = problem.found.of_causes([f.evidence.cause for f in left if f is not finding])
+        named = [f.evidence.cause for f in left if f is not finding]
+        others = problem.found.of_causes([*named, *aside])
         without, low = problem.fitted_sizes(others, e.sizes)
         own = problem.found.of_causes([e.cause])
         sizes, high = problem.fitted_sizes([*others, *own], without)
