@@ -289,6 +289,7 @@ READ_ONLY = {
         python -m studies random --count 50 --seed 1 --output docs/results
         python -m studies real --output docs/results
         python -m studies stepping --output FOLDER
+        python -m studies stepping --foods tomato_sequence
         python -m studies verification --fit
         python -m studies verification --output docs/results/verification.md
         """,  # noqa: E501

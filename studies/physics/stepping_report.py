@@ -67,24 +67,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="cucumber at 100 mm/s against its step of 2.5e-4 s, without effects and station",
     )
+    parser.add_argument(
+        "--foods",
+        metavar="SCENARIO",
+        nargs="+",
+        help="those of these scenarios alone, without effects and station (a minute each)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     scenarios = [
         load_scenario(resource_path(f"scenarios/{name}.yaml"))
-        for name in (FOODS[:1] if options.quick else FOODS)
+        for name in (options.foods or (FOODS[:1] if options.quick else FOODS))
     ]
     foods = [sliced_food(scenario) for scenario in scenarios]
     steps = study.STEPS[2 if options.quick else 0 :]
+    few = options.quick or options.foods
     others = []
-    for name in () if options.quick else HELD_OUT:
+    for name in () if few else HELD_OUT:
         food, knife, numerics = sliced_food(load_scenario(resource_path(f"scenarios/{name}.yaml")))
         others.append((dc.replace(food, name=f"{food.name} (held out)"), knife, numerics))
     cases = study.stepping_cases(foods + others, (0.1,) if options.quick else (0.02, 0.1))
     if options.quick:
         cases = [dc.replace(case, true_masses=False) for case in cases]
-    else:
+    elif not few:
         cases += effect_cases(foods)
     with _bar("cuts") as bar:
         results = study.stepping_study(cases, steps, progress=_mover(bar))
@@ -100,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
     }
     folder = options.output
     page = folder and folder / "stepping.md"
-    if options.quick:
+    if few:
         publish("\n\n".join(tables.values()), page)
     else:
         tables["slices"] = study.inertia_by_step_table(foods)
