@@ -269,7 +269,7 @@ READ_ONLY = {
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
-        python -m studies bands --laws slice_push bonds --draws 2
+        python -m studies bands --laws slice_push bonds --draws 6
         python -m studies calibration --foods cucumber potato --polish cucumber potato --steps 0 --starts 1 --point-steps 0 --output FOLDER
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
@@ -279,6 +279,7 @@ READ_ONLY = {
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 5
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 6
+        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 2 --minutes 16
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 3
         python -m studies bench_score FOLDER --keep docs/results/benches_report.jsonl
         python -m studies bench_score docs/results/benches_report.jsonl
