@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.bands import force_band, independent
+from sliceit_drake.calibration.bands import ForceBand, force_band, independent
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.prediction import Parameter
 
@@ -57,6 +57,14 @@ def band_of(model):
 
 def bump(depth, at, wide=3e-3):
     return np.exp(-(((depth - at) / wide) ** 2)) * (depth > 0.0)
+
+
+def test_a_twentieth_lies_below_and_above_a_band_of_two_slices():
+    """With half of the normal distribution about each, that is a tenth of a half."""
+    band = ForceBand(np.array([[0.0, 3.0], [10.0, 3.0]]), np.array([1.0, 2.0]), np.full(2, 0.5))
+    low, high = band.interval()
+    assert low == pytest.approx([-1.2816, 3.0 - 2.0 * 1.6449], abs=1e-3)
+    assert high == pytest.approx([11.2816, 3.0 + 2.0 * 1.6449], abs=1e-3)
 
 
 def test_nine_of_ten_measurements_are_in_a_band_of_90_percent():
