@@ -6,7 +6,10 @@ from test_calibration import bench_records, coarse_setup
 
 from sliceit_drake.calibration import first_fit as module
 from sliceit_drake.calibration.first_fit import first_fit
+from sliceit_drake.cli.main import main
+from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.records.slice_record import write_record
 
 
 def test_a_first_fit_follows_the_record_and_draws_it(tmp_path):
@@ -40,3 +43,18 @@ def test_a_first_fit_passes_over_starts_that_break_down(monkeypatch):
     monkeypatch.setattr(module, "gauss_newton", breaks)
     with pytest.raises(CuttingError, match="widen the setup's ranges"):
         first_fit(coarse_setup(), bench_records(1), 1)
+
+
+def test_a_calibration_goes_on_without_a_first_fit(tmp_path, monkeypatch, capsys):
+    def breaks(*given, **named):
+        raise CuttingError("it breaks down")
+
+    monkeypatch.setattr(module, "first_fit", breaks)
+    monkeypatch.chdir(tmp_path)
+    write_record(bench_records(1)[0], tmp_path / "press")
+    dump_yaml(coarse_setup(), tmp_path / "setup.yaml")
+    words = ["calibrate", "press.csv", "--food", "setup.yaml", "--output", "out", "--workers", "1"]
+    words += ["--trials", "4", "--steps", "0", "--starts", "1", "--blocks", "0"]
+    assert main(words) == 0
+    assert "No first fit: it breaks down" in capsys.readouterr().out
+    assert (tmp_path / "out/food.yaml").exists() and not (tmp_path / "out/first_fit.png").exists()

@@ -38,7 +38,11 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from sliceit_drake.calibration.result import Calibration
+    from sliceit_drake.calibration.setup import CalibrationSetup
+    from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["add_arguments", "run"]
 
@@ -179,7 +183,6 @@ def _calibrate(options: argparse.Namespace) -> int:
     import sys
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
-    from sliceit_drake.calibration.first_fit import first_fit
     from sliceit_drake.calibration.setup import load_setup, setup_of_record
     from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.calibration.structure import choice_in, puncture_lines
@@ -207,13 +210,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     start = values_of(load_calibrated_food(options.start)) if options.start else None
     warnings: list[str] = []
     if start is None:
-        with StageBars() as bars:
-            first = first_fit(
-                setup, fitted, options.workers, lambda done, all: bars.show("first fit", done, all)
-            )
-        options.output.mkdir(parents=True, exist_ok=True)
-        first.save(options.output / "first_fit.png")
-        print(f"First fit, on a coarse mesh: {first.rms:.3f} N, {options.output}/first_fit.png")
+        _first_fit(setup, fitted, options)
     if options.structure == "choose":
         with StageBars() as bars:
             choice = choice_in(
@@ -254,6 +251,26 @@ def _calibrate(options: argparse.Namespace) -> int:
         _fit_points(options, result)
     print(f"Results in {options.output}/")
     return 0
+
+
+def _first_fit(
+    setup: "CalibrationSetup", records: "Sequence[SliceRecord]", options: argparse.Namespace
+) -> None:
+    """Draws a first fit. Where there is none, a search may still find what can be cut."""
+    from sliceit_drake.calibration.first_fit import first_fit
+    from sliceit_drake.cutting.solver import CuttingError
+
+    try:
+        with StageBars() as bars:
+            found = first_fit(
+                setup, records, options.workers, lambda done, all: bars.show("first fit", done, all)
+            )
+    except CuttingError as error:
+        print(f"No first fit: {error}")
+        return
+    options.output.mkdir(parents=True, exist_ok=True)
+    found.save(options.output / "first_fit.png")
+    print(f"First fit, on a coarse mesh: {found.rms:.3f} N, {options.output}/first_fit.png")
 
 
 def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:

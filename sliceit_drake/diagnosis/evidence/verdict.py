@@ -193,7 +193,8 @@ def reach_verdict(
         screening = screen(problem, replicates, seed + len(findings), assumed, progress)
         screenings.append(screening)
         # Beside what is only set aside nothing is excluded.
-        judged += [] if aside else [screening]
+        if not aside:
+            judged.append(screening)
         beside_it = "".join(f", beside {o.name}, whose {_at_bound(o)}" for o in aside)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             if aside:
