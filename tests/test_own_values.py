@@ -1,12 +1,14 @@
 """Slices that differ are each seen from their own height, not from the mean slice's."""
 
 import dataclasses as dc
+from types import SimpleNamespace
 
 import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
+from sliceit_drake.diagnosis.prediction import Point
 
 HEIGHT = 3e-4
 DEVIATION = 0.1
@@ -66,7 +68,7 @@ def left(problem: LinearProblem) -> float:
 
 def test_a_bend_that_lies_higher_in_some_slices_is_not_taken_for_a_softer_one():
     first = session([-4e-4, 3e-4, -2e-4, 4e-4, -3e-4, 2e-4])
-    again = LinearProblem(at_own_values(first))
+    again = at_own_values(first)
     assert left(first) > 4.0
     assert left(again) < 2.0
 
@@ -74,14 +76,14 @@ def test_a_bend_that_lies_higher_in_some_slices_is_not_taken_for_a_softer_one():
 def test_slices_that_are_alike_stay_as_they_are():
     first = session([0.0] * 6)
     again = at_own_values(first)
-    for a, b in zip(first.found.records, again.records, strict=True):
+    for a, b in zip(first.found.records, again.found.records, strict=True):
         assert b.bent is not None and np.abs(b.bent).max() < 0.1 * DEVIATION
         np.testing.assert_array_equal(a.columns[:, :, 0], b.columns[:, :, 0])
         np.testing.assert_allclose(a.predicted, b.predicted - b.bent)
 
 
 def test_what_is_beyond_the_first_order_stays_in_other_predictions_and_counts_for_less():
-    problem = LinearProblem(at_own_values(session([-4e-4, 4e-4, 2e-4])))
+    problem = at_own_values(session([-4e-4, 4e-4, 2e-4]))
     found = problem.found.records
     raised = problem.predicting([r.predicted - r.bent + 1.0 for r in found])
     for old, new in zip(found, raised.found.records, strict=True):
@@ -89,3 +91,44 @@ def test_what_is_beyond_the_first_order_stays_in_other_predictions_and_counts_fo
     plain = dc.replace(found[0], bent=None)
     more = problem.model_error(found[0]) ** 2 - problem.model_error(plain) ** 2
     np.testing.assert_allclose(more, 0.25 * found[0].bent ** 2, atol=1e-12)
+
+
+class Simulation:
+    """The force itself in place of a simulator's."""
+
+    def __init__(self, problem: LinearProblem) -> None:
+        self.targets = [
+            SimpleNamespace(facts=SimpleNamespace(name=r.name), compare=lambda w: w[:, :1])
+            for r in problem.found.records
+        ]
+        self.depth = problem.found.records[0].depth
+
+    def predict(self, points: list[Point], _: object) -> list[list[SimpleNamespace]]:
+        return [
+            [self.series(point, target.facts.name) for target in self.targets] for point in points
+        ]
+
+    def series(self, point: Point, name: str) -> SimpleNamespace:
+        force = bend(self.depth, point.records.get(name, {}).get("height", 0.0))
+        return SimpleNamespace(wrench=np.repeat(force[:, None], 6, axis=1))
+
+
+def test_slices_far_from_the_mean_are_simulated_where_they_are():
+    first = session([-9e-4, 1.1e-3, -3e-4, 8e-4, -9e-4, 2e-4])
+    again = at_own_values(first, Simulation(first))
+    assert left(at_own_values(first)) > 4.0
+    assert left(again) < 2.0
+
+
+def test_a_slice_that_breaks_down_at_its_own_values_is_seen_to_second_order():
+    first = session([-4e-4, 4e-4, 2e-4])
+
+    class BreaksDown(Simulation):
+        def series(self, point: Point, name: str) -> SimpleNamespace:
+            found = super().series(point, name)
+            found.wrench *= np.nan if point.records else 1.0
+            return found
+
+    found = at_own_values(first, BreaksDown(first))
+    assert np.isfinite(found.moments.gram).all()
+    assert left(found) < 2.0

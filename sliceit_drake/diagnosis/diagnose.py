@@ -100,7 +100,10 @@ def diagnose(
         progress=lambda done, total: show("simulations", done, total),
     )
     remarks += found.warnings
-    problem = LinearProblem(at_own_values(LinearProblem(found)))
+    predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
+    problem = at_own_values(
+        LinearProblem(found), predictor, lambda done, total: show("own values", done, total)
+    )
     if not problem.repeated:
         remarks.append(
             "No condition was repeated: noise is from what is rough in the residuals, and how "
@@ -125,7 +128,6 @@ def diagnose(
         remarks=remarks,
     )
     if verdict.names:
-        predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
     return result
 

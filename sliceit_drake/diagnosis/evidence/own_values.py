@@ -2,43 +2,96 @@
 
 Where the force bends sharply in depth, as where the last of the food is cut just above the board,
 slices that lie some tenths of a millimetre higher or lower do not average to the mean slice: to
-first order in each slice's height alone their mean is a smoother bend, as of a softer board.
+first order in each slice's height alone their mean is a smoother bend, as of a softer board. And
+where the knife enters, a slice that lies half a millimetre lower is not what twice a quarter does.
 """
 
 import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.sensitivity import Progress
+from sliceit_drake.diagnosis.prediction import Point, SlicePredictor
 
 __all__ = ["at_own_values"]
 
+PASSES = 2
+"""Times that own values are found, each where the records were simulated the time before."""
 
-def at_own_values(problem: LinearProblem) -> Sensitivities:
-    """The sensitivities of a problem, with the columns of each record's own at their values.
 
-    To second order in them: a change c b + e b^2 is linearised at the b that fits the record best,
-    less the mean over all records, which may be another cause's doing. For what e does where that
-    mean is the slices' own, there is a numerical column of each. Beyond the step of the derivative
-    e b^2 goes on in a straight line, as it does past a sharp bend.
+def at_own_values(
+    problem: LinearProblem,
+    predictor: SlicePredictor | None = None,
+    progress: Progress | None = None,
+) -> LinearProblem:
+    """A problem with the columns of each record's own at their values.
+
+    A change c b + e b^2 is linearised at the b that fits the record best, less the mean over all
+    records, which may be another cause's doing. For what e does where that mean is the slices' own,
+    there is a numerical column of each. Beyond the step of the derivative e b^2 goes on in a
+    straight line, as it does past a sharp bend.
+
+    Args:
+        problem: The sensitivities where no record differs from the others.
+        predictor: What simulates the records at their own values, which are then found once more
+            (`PASSES`); without one, and where a slice breaks down there, the change is that of
+            second order.
+        progress: Called with the number of simulated slices, and of those that must be.
     """
     found, own = problem.found, problem.own
-    values = own_coefficients(problem)
-    values -= values.mean(0)
-    records = [_moved(record, own, b) for record, b in zip(found.records, values, strict=True)]
     added = [Column("numerical", f"mean_{found.columns[k].name}") for k in own]
-    return dc.replace(found, columns=[*found.columns, *added], records=records)
+    sizes = {found.columns[k].name: found.columns[k].size for k in own}
+    again = problem
+    for _ in range(1 if predictor is None else PASSES):
+        values = own_coefficients(again)
+        values -= values.mean(0)
+        changes: list[np.ndarray | None] = [None] * len(values)
+        if predictor is not None:
+            changes = _simulated(predictor, sizes, values, progress)
+        records = [
+            _moved(record, own, b, change)
+            for record, b, change in zip(found.records, values, changes, strict=True)
+        ]
+        again = LinearProblem(dc.replace(found, columns=[*found.columns, *added], records=records))
+    return again
 
 
-def _moved(record: RecordSensitivity, own: list[int], b: np.ndarray) -> RecordSensitivity:
+def _simulated(
+    predictor: SlicePredictor,
+    sizes: dict[str, float],
+    values: np.ndarray,
+    progress: Progress | None,
+) -> list[np.ndarray | None]:
+    """What the own values [R, n] change the prediction by, of each record [m, c]; None where its
+    slice breaks down."""
+    own = {
+        target.facts.name: {
+            name: b * size for (name, size), b in zip(sizes.items(), row.tolist(), strict=True)
+        }
+        for target, row in zip(predictor.targets, values, strict=True)
+    }
+    mean, moved = predictor.predict([Point(), Point(records=own)], progress)
+    out: list[np.ndarray | None] = []
+    for target, *ends in zip(predictor.targets, mean, moved, strict=True):
+        wrenches = [series.wrench for series in ends if series is not None]
+        seen = target.compare(np.stack(wrenches, axis=2))
+        change = seen[:, :, 1] - seen[:, :, 0]
+        out.append(change if np.isfinite(change).all() else None)
+    return out
+
+
+def _moved(
+    record: RecordSensitivity, own: list[int], b: np.ndarray, change: np.ndarray | None
+) -> RecordSensitivity:
     even = record.even[:, :, own].astype(float)
     inside = np.clip(b, -1.0, 1.0)
     columns = record.columns.astype(float)
     columns[:, :, own] += 2.0 * even * inside
     # The tangent at b, where the change is e b^2 within the step and e (2 |b| - 1) beyond it.
-    bent = -(even * inside**2).sum(2)
+    bent = -(even * inside**2).sum(2) if change is None else change - columns[:, :, own] @ b
     return dc.replace(
         record,
         predicted=record.predicted + bent,
