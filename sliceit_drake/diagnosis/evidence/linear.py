@@ -149,7 +149,9 @@ class LinearProblem:
             self.noise, self.repeated = tuple(noise), True
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
         self._make_moments()
-        self.variation_samples = sum(len(g) - 1 for g in self.conditions.values())
+        # In the air slices do not differ.
+        cut = [g for g in self.conditions.values() if found.records[g[0]].in_contact.any()]
+        self.variation_samples = sum(len(g) - 1 for g in cut)
         self.variation = self._estimate_variation() if variation is None else variation
 
     def _usual(self) -> tuple[dict[int, float], dict[int, float]]:
