@@ -11,6 +11,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
@@ -46,6 +47,25 @@ def test_a_batch_on_a_gpu_is_that_on_the_cpu():
             np.abs(here.food_wrench - there.food_wrench).max(0), 1e-6 * size.max()
         )
         np.testing.assert_allclose(there.cut, here.cut, atol=1e-9)
+
+
+def test_a_gradient_on_a_gpu_is_that_on_the_cpu():
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device on this machine: CPU and GPU are not compared")
+    found = []
+    for device in ("cpu", "cuda:0"):
+        model = cuts(device)[0]
+        depth = 4e-4 * np.arange(61)
+        p = np.stack([0.5 * depth, 0.0 * depth, model.top + 1e-4 - depth], axis=1)
+        R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(p), 1, 1))
+        adjoint = SliceAdjoint(model, PERIOD)
+        run = adjoint.run(R, p)
+        weights = np.random.default_rng(0).normal(size=run.wrenches.shape)
+        gradient = adjoint.gradient(run, weights)
+        found.append((run.wrenches, gradient.position, gradient.by("toughness"), gradient.by("P")))
+    for here, there in zip(*found, strict=True):
+        assert np.abs(here).max() > 0.0
+        np.testing.assert_allclose(there, here, rtol=0.0, atol=1e-6 * np.abs(here).max())
 
 
 def test_a_device_that_is_not_there_is_named_with_those_that_are():

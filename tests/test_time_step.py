@@ -4,14 +4,16 @@ import dataclasses as dc
 
 import numpy as np
 import pytest
+import warp as wp
 
 from sliceit_drake.cutting.discretization import estimate_discretization_error
 from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder
+from sliceit_drake.cutting.inertia import Factors
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.model import SOFTEST, Numerics, TimeStepError
+from sliceit_drake.cutting.model import SOFTEST, CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -67,13 +69,24 @@ def test_shorter_steps_have_the_same_masses_on_the_way_and_from_the_start(held_s
         assert (coarse.with_step(step).inertia.matrix != direct).nnz == 0
 
 
+class AsOnAGpu(Workspace):
+    """Solves with a thread for each row, as on a GPU."""
+
+    def _factors(self, model: CuttingModel) -> Factors:
+        return model.inertia.inverted
+
+    def solve(self, b: wp.array, y: wp.array) -> None:
+        self.launch(self.kernels.multiply, b.shape, [self.inertia, b, y])
+
+
+@pytest.mark.parametrize("workspace", [Workspace, AsOnAGpu])
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 5e-6), ("float64", 1e-13)])
 @pytest.mark.parametrize("refinement", [0.5, 1.5])
-def test_accelerations_solve_the_mass_matrix(precision, tolerance, refinement):
+def test_accelerations_solve_the_mass_matrix(precision, tolerance, refinement, workspace):
     model = make_food_model(SMALL, Knife(), Numerics(precision=precision), refinement)
     # The smallest is all inverted.
     assert (len(model.inertia.factors.inverse_pivot) == 0) == (refinement < 1.0)
-    ws = Workspace([model], 2e-3)
+    ws = workspace([model], 2e-3)
     ws.capture()
     force = np.zeros((1, len(model.moving) + 1, 4))
     force[..., :3] = np.random.default_rng(1).normal(size=(*force.shape[:2], 3))

@@ -287,8 +287,7 @@ class SliceAdjoint:
         for part in ("step_blade_and_front", "total_points", "place_points", "step_nodes"):
             ws.launch_part(part, k, adjoint=True)
         # By hand: the adjoint of a symmetric solve is the solve of the adjoint.
-        solved = [ws.inertia, forces.acceleration.grad, forces.resultant.grad]
-        ws.launch(kern.solve, (ws.cuts,), solved)
+        ws.solve(forces.acceleration.grad, forces.resultant.grad)
         ws.launch_part("push_blade", k, adjoint=True)
         ws.launch_part("sum_forces", k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]

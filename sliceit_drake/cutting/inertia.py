@@ -71,12 +71,24 @@ class Inertia:
         Raises:
             ValueError: The matrix is not positive definite.
         """
+        return self._factors(_first_inverted)
+
+    @functools.cached_property
+    def inverted(self) -> Factors:
+        """`factors` in which all rows are inverted, for devices that multiply all at once.
+
+        Raises:
+            ValueError: The matrix is not positive definite.
+        """
+        return self._factors(lambda _: 0)
+
+    def _factors(self, first_inverted: Callable[[np.ndarray], int]) -> Factors:
         lu = _factorized(self.matrix, "NATURAL")
         pivot = lu.U.diagonal()
         if (pivot <= 0.0).any() or (lu.perm_r != np.arange(len(pivot))).any():
             raise ValueError("the mass matrix is not positive definite")
         lower = tril(lu.L, -1).tocsc()
-        first = _first_inverted(np.diff(lower.indptr))
+        first = first_inverted(np.diff(lower.indptr))
         last = solve_triangular(
             lower[first:, first:].toarray(),
             np.eye(len(pivot) - first),

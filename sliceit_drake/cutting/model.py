@@ -600,7 +600,7 @@ class CuttingModel(CutGeometry):
             raise TypeError(f"a cut has no {', '.join(unknown)} to change")
         # With what was computed of the geometry.
         derived = copy.copy(self)
-        vars(derived).update(changes, _inertia_of=inertia_of)
+        vars(derived).update(changes, _inertia_of=inertia_of, _strips=self._strips)
         derived.__post_init__()
         return derived
 

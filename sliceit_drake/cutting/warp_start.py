@@ -57,7 +57,7 @@ def start_warp() -> None:
         warp.init()
 
 
-def load_modules(names: Sequence[str], device: Any) -> None:
+def load_modules(names: Sequence[str], device: Any, block: int | None = None) -> None:
     """Compiles modules of kernels side by side, once a machine, and loads them, once a process.
 
     Where another thread is at one of them it is waited for.
@@ -65,9 +65,10 @@ def load_modules(names: Sequence[str], device: Any) -> None:
     Args:
         names: Of the modules; `start_warp` was called.
         device: One of Warp's, or its name.
+        block: Threads of a block on a GPU, as they are launched; Warp's own by default.
     """
     with ThreadPoolExecutor(2) as threads:
-        for loaded in [threads.submit(_load_module, name, device) for name in names]:
+        for loaded in [threads.submit(_load_module, name, device, block) for name in names]:
             loaded.result()
 
 
@@ -79,11 +80,11 @@ def shared(values: Any, dtype: Any = float) -> Any:
     return wp.array(values, dtype=dtype, device="cpu", copy=False)
 
 
-def _load_module(name: str, device: Any) -> None:
+def _load_module(name: str, device: Any, block: int | None) -> None:
     import warp as wp
 
     with _LOADING[name]:
-        wp.load_module(name, device=device)
+        wp.load_module(name, device=device, block_dim=block)
 
 
 def _find_cache() -> None:

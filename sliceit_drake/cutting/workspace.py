@@ -9,6 +9,7 @@ import warp as wp
 from scipy.sparse import coo_array
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.inertia import Factors
 from sliceit_drake.cutting.kernels import layouts
 from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.kernels.types import CORNERS, GATHER, LANES, PARAMETERS, STRIP
@@ -30,6 +31,9 @@ POINT_NUMBERS = {
     "edge_force",
 }
 """Arrays with a number for each cut point."""
+GPU_BLOCK = 64
+"""Threads of a block on a GPU: those of elements and points need most of a multiprocessor's
+registers, so that larger blocks leave others without work."""
 
 
 class Workspace:
@@ -196,7 +200,7 @@ class Workspace:
         self.parameters, values = k.Parameters(), _parameter_arrays(m)
         self.parameter_rows, layout = self._rows(self.parameters, _shapes(values))
         self.parameter_layout = self._without_fill(layout)
-        self.inertia, factors = k.Inertia(), m.inertia.factors
+        self.inertia, factors = k.Inertia(), self._factors(m)
         places = ("lower_start", "lower_index", "upper_start", "upper_index")
         self._set(self.inertia, **{name: getattr(factors, name) for name in places})
         for name in FACTORS:
@@ -284,10 +288,14 @@ class Workspace:
         inertia = [model.inertia for model in models]
         if [id(each) for each in inertia] != [id(model.inertia) for model in self.models]:
             for name in FACTORS:
-                values = np.array([getattr(each.factors, name) for each in inertia])
+                values = np.array([getattr(self._factors(m), name) for m in models])
                 if values.size:
                     self.write(getattr(self.inertia, name), values)
         self.models = tuple(models)
+
+    def _factors(self, model: CuttingModel) -> Factors:
+        """Of the mass matrix, as `solve` needs them."""
+        return model.inertia.factors if self._on_host else model.inertia.inverted
 
     def take_axes(self, R_AC: np.ndarray) -> None:
         """Gives wrenches in the axes of a frame A from now on; R_AC [3, 3] is not to be changed."""
@@ -328,6 +336,7 @@ class Workspace:
             adj_inputs=empty if adjoint else [],
             adjoint=adjoint,
             device=self.device,
+            block_dim=None if self._on_host else GPU_BLOCK,
         )
 
     def launch_look_ahead(self, k: int = 0, adjoint: bool = False) -> None:
@@ -352,6 +361,9 @@ class Workspace:
         if self._gradients:
             now, after, forces = self.slots[k], self.slots[k + 1], self.forces[k]
         dt = self.dt if dt is None else dt
+        if part == "solve":
+            self.solve(forces.resultant, forces.acceleration)
+            return
         states = [now, after, forces, sums]
         entries, inputs = {
             "elements": (len(m.blocks), [now, mesh, parameters, forces]),
@@ -363,7 +375,6 @@ class Workspace:
             "gather": (len(m.moving), [mesh, forces]),
             "sum_forces": (len(m.moving), [dt, mesh, parameters, *states]),
             "weigh_added_inertia": (0, [k, parameters, self.motion, forces, self._results]),
-            "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
             "place_points": (
@@ -379,6 +390,15 @@ class Workspace:
             threads, per_thread = (1, entries) if self.device.is_cpu else (entries, 1)
             shape, inputs = (self.cuts, threads), [*inputs, per_thread]
         self.launch(getattr(self.kernels, part), shape, inputs, adjoint)
+
+    def solve(self, b: wp.array, y: wp.array) -> None:
+        """Solves S y = b [C, K + 1] with the mass matrices S: by substitution with a thread for
+        each cut, or on a GPU by the inverse with a thread for each row."""
+        inputs = [self.inertia, b, y]
+        if self._on_host:
+            self.launch(self.kernels.solve, (self.cuts,), inputs)
+        else:
+            self.launch(self.kernels.multiply, b.shape, inputs)
 
     def launch_substep(self, k: int) -> None:
         """One sub-step."""
@@ -396,7 +416,8 @@ class Workspace:
     def captured(self, launch: Callable[[], None]) -> Any:
         """Graph of the launches that `launch` makes; compiles the kernels, once a machine."""
         with LAUNCH_LOCK:
-            load_modules(self.kernels.modules, self.device)
+            block = None if self._on_host else GPU_BLOCK
+            load_modules(self.kernels.modules, self.device, block)
             with wp.ScopedCapture(device=self.device) as capture:
                 launch()
         return capture.graph

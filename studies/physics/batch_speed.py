@@ -83,13 +83,15 @@ def run(options: argparse.Namespace) -> int:
     PLACE.check(options.output)
     machine = describe_machine()
     rows, first, elements = [], None, 0
-    for device in devices():
+    found = devices()
+    for device in found:
         batches = options.batches or (CPU_BATCHES if device == "cpu" else GPU_BATCHES)
         for count in tqdm(batches, desc=device):
             slices, forces, elements = rate(device, count, options.refinement, options.repeats)
             first = forces if first is None else first
             difference = np.sqrt(((forces - first) ** 2).mean() / (first**2).mean())
             rows.append((device, count, f"{slices:.2f}", f"{100 * difference:.4f} %"))
+            tqdm.write(f"{device}: {count} cuts in one call, {slices:.2f} slices a second")
     PLACE.publish(
         options.output,
         rows=rows,
@@ -97,6 +99,6 @@ def run(options: argparse.Namespace) -> int:
         repeats=options.repeats,
         command=options.command,
         machine=machine,
-        cuda=wp.is_cuda_available(),
+        gpu=wp.get_device("cuda:0").name if "cuda:0" in found else "",
     )
     return 0

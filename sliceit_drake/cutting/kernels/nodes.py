@@ -262,6 +262,16 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         multiply_last(cut, S, y)
         substitute(cut, True, S.upper_start, S.upper_index, S.upper, d, y, y)
 
+    @wp.kernel(enable_backward=False, module=module)
+    def multiply(S: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
+        """Solves S y = b where all rows of S are inverted: a thread for each row, on a GPU."""
+        cut, row = wp.tid()
+        stride = S.inverse.shape[1] // b.shape[1]
+        total = vec4()
+        for k in range(b.shape[1]):
+            total += S.inverse[cut, k * stride + row] * b[cut, k]
+        y[cut, row] = total
+
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(
         dt: real,
@@ -401,6 +411,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         load_nodes=load_nodes,
         push_blade=push_blade,
         solve=solve,
+        multiply=multiply,
         weigh_added_inertia=weigh_added_inertia,
         step_nodes=step_nodes,
         total_points=total_points,
