@@ -3,6 +3,8 @@
 It begins with a food that has none of them and takes, one after the other, the element that
 predicts left-out depth best, as long as that gains `GAIN`. Fits stop in the minimum that is next,
 and an element may belong to another one: all minima that were found go on to the next comparison.
+At the end the setup's own food is compared on the setup's mesh: its elements may be nothing one by
+one, and a thin skin is nothing on a coarse mesh.
 Which elements are worth a fit from which minimum is told by a slice with each switched on, added to
 the linear problem there. All is computed on a coarse mesh: it is to choose, not to calibrate.
 """
@@ -295,7 +297,46 @@ def choose_structure(
                 f"{element.name}: left. A slice with it promises "
                 f"{100.0 * max(promised[element.name], 0.0):.0f} % on left-out depth"
             )
+    given = _elements_of(setup, elements)
+    if given and set(given) != set(taken):
+        named = f"The setup's own food, with {' and '.join(given)}"
+        fine = _fit(
+            coarse_predictor(current.setup, records, workers, 1.0), current.setup, current.values
+        )
+        whole = _as_given(setup, records, workers)
+        if whole is None:
+            lines.append(f"{named}: left, its slices break down")
+        elif fine is not None and whole.left_out > (1.0 - GAIN) * fine.left_out:
+            lines.append(f"{named}: left. {_change(fine, whole)}")
+        else:
+            change = "" if fine is None else f" On the setup's mesh: {_change(fine, whole)}"
+            lines.append(f"{named}: taken instead.{change}")
+            current, taken, warnings = whole, given, []
     return StructureChoice(current.setup, current.values, taken, lines, warnings)
+
+
+def _elements_of(setup: CalibrationSetup, elements: Sequence[_Element]) -> list[str]:
+    """Names of the elements that the food of a setup has."""
+    varied = {r.name for r in setup.parameters}
+    known = {name.split(".")[1] for name in varied if name.startswith("effects.")}
+    for name, off in OFF.items():
+        _, group, field = name.split(".")
+        if getattr(getattr(setup.food.effects, group), field) != off:
+            known.add(group)
+    return [
+        e.name
+        for e in elements
+        if not e.needs and e.ranges and e.ranges[0].name.split(".")[1] in known
+    ]
+
+
+def _as_given(
+    setup: CalibrationSetup, records: Sequence[SliceRecord], workers: int | None
+) -> _Fitted | None:
+    """The setup as it is, fitted on its mesh; None where its slices break down."""
+    predictor = coarse_predictor(setup, records, workers, 1.0)
+    starts = [{p.name: p.start for p in predictor.parameters}, first_starts(predictor)[0]]
+    return next(iter(_best_first([_fit(predictor, setup, start) for start in starts])), None)
 
 
 def _change(before: _Fitted, after: _Fitted) -> str:
@@ -380,10 +421,13 @@ def _named(element: _Element, values: tuple[float, ...]) -> dict[str, float]:
 
 
 def coarse_predictor(
-    setup: CalibrationSetup, records: Sequence[SliceRecord], workers: int | None
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    workers: int | None,
+    refinement: float = COARSE,
 ) -> Predictor:
-    """Of records on a coarse mesh, with the sub-step of the search."""
-    coarse = dc.replace(setup, refinement=COARSE * setup.refinement)
+    """Of records on a mesh that is coarser than the setup's, with the sub-step of the search."""
+    coarse = dc.replace(setup, refinement=refinement * setup.refinement)
     return Predictor(coarse, records, setup.search_time_step, workers=workers)
 
 
