@@ -144,9 +144,9 @@ def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> lis
     return out
 
 
-def own_coefficients(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> np.ndarray:
-    """Coefficients of `LinearProblem.own` beside causes [R, n], in the columns' sizes."""
-    linear = _Linear(problem, causes)
+def own_coefficients(problem: LinearProblem) -> np.ndarray:
+    """Coefficients of `LinearProblem.own` without causes [R, n], in the columns' sizes."""
+    linear = _Linear(problem, ())
     theta = linear.shared()
     records = range(len(problem.found.records))
     return np.array([linear.of_own(r, theta)[: len(problem.own)] for r in records])

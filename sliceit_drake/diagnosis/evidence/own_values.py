@@ -7,11 +7,10 @@ where the knife enters, a slice that lies half a millimetre lower is not what tw
 """
 
 import dataclasses as dc
-from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column, RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
@@ -27,7 +26,6 @@ def at_own_values(
     problem: LinearProblem,
     predictor: SlicePredictor | None = None,
     progress: Progress | None = None,
-    causes: Sequence[CauseAtScan] = (),
 ) -> LinearProblem:
     """A problem with the columns of each record's own at their values.
 
@@ -42,14 +40,13 @@ def at_own_values(
             (`PASSES`); without one, and where a slice breaks down there, the change is that of
             second order.
         progress: Called with the number of simulated slices, and of those that must be.
-        causes: What acts beside: slices of one condition would else differ from the others by it.
     """
     found, own = problem.found, problem.own
     added = [Column("numerical", f"mean_{found.columns[k].name}") for k in own]
     sizes = {found.columns[k].name: found.columns[k].size for k in own}
     again = problem
     for _ in range(1 if predictor is None else PASSES):
-        values = own_coefficients(again, causes)
+        values = own_coefficients(again)
         values -= values.mean(0)
         changes: list[np.ndarray | None] = [None] * len(values)
         if predictor is not None:
