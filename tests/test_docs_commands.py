@@ -103,7 +103,7 @@ TESTED = {
     "tests/test_causes.py::test_a_cause_in_a_file_is_loaded_and_used": [
         "sliceit diagnose records/monday --model cucumber --output output/a --cause my_cause.py",
     ],
-    "tests/test_hidden_effects_found.py::test_a_fresh_draw_of_effects_is_diagnosed_rightly": [
+    "tests/test_hidden_effects_found.py::test_fresh_draws_of_effects_are_diagnosed_rightly": [
         "sliceit diagnose RECORDS_DIR --model cucumber --output DIR",
         "sliceit diagnose RECORDS --model FOOD --output DIR",
         "sliceit diagnose records/a --model cucumber --output a",
@@ -295,7 +295,7 @@ READ_ONLY = {
         python -m studies verification --output docs/results/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
-        python -m studies batch_speed --output docs/results/speed.md
+        python -m studies batch_speed --repeats 1 --output docs/results/speed.md
         python -m studies calibration_times --foods cucumber tomato potato
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json

@@ -103,7 +103,7 @@ def test_two_modules_of_kernels_are_loaded_side_by_side_and_none_by_two_threads(
     together = threading.Barrier(2, timeout=30.0)
     at_work, twice = set(), []
 
-    def load(name, device):
+    def load(name, device, block_dim):
         twice.extend({name} & at_work)
         at_work.add(name)
         together.wait()  # Breaks where another does not come while this one is at work.
