@@ -296,7 +296,8 @@ READ_ONLY = {
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
         python -m studies batch_speed --repeats 1 --output docs/results/speed.md
-        python -m studies calibration_times --foods cucumber tomato potato
+        python -m studies calibration_times --foods potato
+        python -m studies calibration_times --foods tomato cucumber
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
         python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png --json docs/results/benchmarks/cutting_speed.json

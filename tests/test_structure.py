@@ -222,3 +222,21 @@ def test_the_command_says_what_it_compared_and_calibrates_what_it_took(
     assert "skin: left." in said and "Warning: skin and core fit alike" in said
     assert "warning: warning:" not in said.lower()
     assert (tmp_path / "out" / "structure.json").exists()
+
+
+@pytest.mark.second_tier
+def test_a_skin_of_the_setup_that_a_coarse_mesh_cannot_show_is_taken_on_the_setups_mesh():
+    record = load_record(resource_path("calibration/records/tomato.csv"))
+    choice = choose_structure(load_setup("tomato"), [record])
+    assert choice.taken == ["skin"]
+    assert choice.setup.food.effects.skin.thickness > 0.0
+    assert choice.values["effects.skin.toughness"] > 0.0
+    assert any("The setup's own food, with skin: taken instead" in line for line in choice.lines)
+
+
+def test_a_setup_has_the_elements_that_it_varies_or_has_switched_on():
+    tomato = load_setup("tomato")
+    elements = structure._elements(tomato, 0.048, free=True)
+    assert structure._elements_of(tomato, elements) == ["skin"]
+    assert structure._elements_of(structure._without_elements(tomato), elements) == []
+    assert structure._elements_of(load_setup("potato"), elements) == []

@@ -335,8 +335,7 @@ def _as_given(
 ) -> _Fitted | None:
     """The setup as it is, fitted on its mesh; None where its slices break down."""
     predictor = coarse_predictor(setup, records, workers, 1.0)
-    starts = [{p.name: p.start for p in predictor.parameters}, first_starts(predictor)[0]]
-    return next(iter(_best_first([_fit(predictor, setup, start) for start in starts])), None)
+    return _fit(predictor, setup, first_starts(predictor)[0])
 
 
 def _change(before: _Fitted, after: _Fitted) -> str:
