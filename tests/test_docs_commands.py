@@ -103,7 +103,7 @@ TESTED = {
     "tests/test_causes.py::test_a_cause_in_a_file_is_loaded_and_used": [
         "sliceit diagnose records/monday --model cucumber --output output/a --cause my_cause.py",
     ],
-    "tests/test_hidden_effects_found.py::test_fresh_draws_of_effects_are_diagnosed_rightly": [
+    "tests/test_hidden_effects_found.py::test_a_fresh_draw_of_effects_is_diagnosed_rightly": [
         "sliceit diagnose RECORDS_DIR --model cucumber --output DIR",
         "sliceit diagnose RECORDS --model FOOD --output DIR",
         "sliceit diagnose records/a --model cucumber --output a",

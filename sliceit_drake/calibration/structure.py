@@ -6,7 +6,7 @@ and an element may belong to another one: all minima that were found go on to th
 At the end the setup's own food is compared on the setup's mesh: its elements may be nothing one by
 one, and a thin skin is nothing on a coarse mesh.
 Which elements are worth a fit from which minimum is told by a slice with each switched on, added to
-the linear problem there. All is computed on a coarse mesh: it is to choose, not to calibrate.
+the linear problem there. All else is computed on a coarse mesh: it is to choose, not to calibrate.
 """
 
 import dataclasses as dc
