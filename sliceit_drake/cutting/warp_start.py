@@ -10,11 +10,20 @@ import tempfile
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CACHE", "CPU_FLAGS", "LAUNCH_LOCK", "VERBOSE", "load_modules", "shared", "start_warp"]
+__all__ = [
+    "CACHE",
+    "CPU_FLAGS",
+    "LAUNCH_LOCK",
+    "VERBOSE",
+    "load_modules",
+    "shared",
+    "start_loading",
+    "start_warp",
+]
 
 LAUNCH_LOCK = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
@@ -67,9 +76,22 @@ def load_modules(names: Sequence[str], device: Any, block: int | None = None) ->
         device: One of Warp's, or its name.
         block: Threads of a block on a GPU, as they are launched; Warp's own by default.
     """
-    with ThreadPoolExecutor(2) as threads:
-        for loaded in [threads.submit(_load_module, name, device, block) for name in names]:
-            loaded.result()
+    for loaded in start_loading(names, device, block):
+        loaded.result()
+
+
+def start_loading(
+    names: Sequence[str], device: Any, block: int | None = None
+) -> list[Future[None]]:
+    """Starts what `load_modules` does, and comes back at once; arguments as there.
+
+    Returns:
+        The loads, in the order of `names`; a program that ends meanwhile waits for them.
+    """
+    threads = ThreadPoolExecutor(2)
+    loads = [threads.submit(_load_module, name, device, block) for name in names]
+    threads.shutdown(wait=False)
+    return loads
 
 
 def shared(values: Any, dtype: Any = float) -> Any:

@@ -3,7 +3,6 @@
 import dataclasses as dc
 import gc
 import json
-import threading
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.cutting.warp_start import load_modules, start_warp
+from sliceit_drake.cutting.warp_start import start_loading, start_warp
 from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
 from sliceit_drake.diagrams.outputs.animation import (
     NEEDED,
@@ -325,7 +324,7 @@ def prepare_run(
         policy = None
     profile = measured_profile(scenario)
     if cutting is None and isinstance(scenario.food, Food) and scenario.numerics.device == "cpu":
-        _start_loading(wp.float32 if scenario.numerics.precision == "float32" else wp.float64)
+        _start_kernels(wp.float32 if scenario.numerics.precision == "float32" else wp.float64)
     station = MakeStation(scenario, meshcat, cutting=cutting, controller=controller)
     diagram = ScenarioDiagram(scenario, station=station, policy=policy)
     margin = check_contact_margin(station) if controller is None else None
@@ -348,13 +347,13 @@ def prepare_run(
     return Run(scenario, diagram, simulator, profile, margin, meshcat, film, animation, own)
 
 
-def _start_loading(real: Any) -> None:
+def _start_kernels(real: Any) -> None:
     """Compiles the kernels for the CPU while the station is made; what needs one waits for it."""
     start_warp()
     points, others = kernels(real).modules
     # The controller's is needed first, and the points take longest.
     names = [update_arm.module.name, points, others]
-    threading.Thread(target=load_modules, args=(names, "cpu")).start()
+    start_loading(names, "cpu")
 
 
 def _written(scenario: Scenario) -> Scenario:
