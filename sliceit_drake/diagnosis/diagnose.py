@@ -9,6 +9,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.at_size import AtSize
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
@@ -116,14 +117,16 @@ def diagnose(
         done[0] += more
         show("bootstrap", done[0], steps)
 
-    verdict = reach_verdict(problem, replicates, seed, count)
+    by_name = {c.name: c for c in causes}
+    at_size = AtSize(predictor, by_name, lambda done, total: show("at size", done, total))
+    verdict = reach_verdict(problem, replicates, seed, count, at_size=at_size)
     show("bootstrap", steps, steps)
     result = Diagnosis(
         verdict=verdict,
-        problem=problem,
+        problem=verdict.problem,
         setup=setup,
-        causes={c.name: c for c in causes},
-        shifts=_shifts(problem, verdict.named),
+        causes=by_name,
+        shifts=_shifts(verdict.problem, verdict.named),
         gain=None,
         remarks=remarks,
     )

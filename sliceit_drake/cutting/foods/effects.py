@@ -323,8 +323,8 @@ class Adhesion:
 class SlicePush:
     """How much a draw helps: the vertical force is R w / (1 + xi^2)^exponent; Atkins: 1."""
 
-    exponent: float = quantity(1.0, "", low=0.5, high=3.0)
-    """1 for Atkins' law."""
+    exponent: float = quantity(1.0, "", low=0.0, high=3.0)
+    """1 for Atkins' law; 0 where a draw does not help."""
     pull: float = quantity(0.0, "", low=-1.0, high=1.0)
     """Share by which the edge pulls along itself more than xi times the press."""
 

@@ -111,7 +111,7 @@ class SlicePushLaw(Cause):
     family = "material"
     parameters = (
         CauseParameter(
-            "exponent", "", 0.25, low=-0.5, high=2.0, adds_to="effects.slice_push.exponent"
+            "exponent", "", 0.25, low=-1.0, high=2.0, adds_to="effects.slice_push.exponent"
         ),
         CauseParameter("pull", "", 0.15, low=-1.0, high=1.0, adds_to="effects.slice_push.pull"),
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.stats import norm
 
+from sliceit_drake.diagnosis.evidence.at_size import AtSize
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
 from sliceit_drake.diagnosis.evidence.held_out import foretells
@@ -39,6 +40,8 @@ OF_THE_BOARD = ("board_height", "board_stiffness")
 measured, and then seems to be of another stiffness as well."""
 HALF = 0.5
 """Least share of the simulation's own error that a cause can do which is said to be near."""
+SEEN_AT_SIZE = 1
+"""Causes that gain most, which are seen at the size that is found."""
 LAW = "law"
 """Name of the simulation's own law in a group."""
 
@@ -140,6 +143,7 @@ class Verdict:
         mostly: Where that is: channel, phase and part of the discrepancy with their share of its
             mean square, the largest first.
         reason: In a sentence.
+        problem: The records, with causes as they were seen.
         slices_needed: Replicates of each condition that are missing.
         trend: What goes with the number of the slice beside the findings; None for nothing.
     """
@@ -152,6 +156,7 @@ class Verdict:
     misfit: float
     mostly: list[tuple[str, str, str, float]]
     reason: str
+    problem: LinearProblem
     slices_needed: int = 0
     trend: Trend | None = None
 
@@ -177,8 +182,17 @@ def reach_verdict(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
     rule: DecisionRule | None = None,
+    at_size: AtSize | None = None,
 ) -> Verdict:
-    """Screens, names the cause with most evidence that may be named, and goes on beside it."""
+    """Screens, names the cause with most evidence that may be named, and goes on beside it.
+
+    Args:
+        problem: The records.
+        replicates, seed: Of the draws of what chance gives.
+        progress: Called with a number of replicates each time that these are done.
+        rule: When a cause is named.
+        at_size: What sees causes at the size that is found; without one by derivatives alone.
+    """
     rule = rule or DecisionRule()
     counts = [len(m) for m in problem.conditions.values()]
     needed = rule.replicates - max(counts) if max(counts) < rule.replicates else 0
@@ -191,6 +205,13 @@ def reach_verdict(
     while True:
         assumed = [e.cause for e in (*(f.evidence for f in findings), *aside)]
         screening = screen(problem, replicates, seed + len(findings), assumed, progress)
+        if at_size is not None and screening.p_value <= rule.alarm:
+            gaining = sorted(screening.causes, key=lambda e: -e.gain)[:SEEN_AT_SIZE]
+            shared = [e for e in gaining if e.score > 0.0 and not e.per_record]
+            corrected = at_size(problem, shared)
+            if corrected is not None:
+                problem = corrected
+                continue
         screenings.append(screening)
         # Beside what is only set aside nothing is excluded.
         if not aside:
@@ -247,7 +268,17 @@ def reach_verdict(
         kind = "cause" if len(findings) == 1 else "causes"
         reason = f"{_named(findings)}; beside that {shown}, mostly {_words(mostly)}"
     return Verdict(
-        kind, findings, screenings, causes, wrong, misfit, mostly, reason, max(needed, 0), trend
+        kind,
+        findings,
+        screenings,
+        causes,
+        wrong,
+        misfit,
+        mostly,
+        reason,
+        problem,
+        max(needed, 0),
+        trend,
     )
 
 

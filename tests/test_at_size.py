@@ -1,0 +1,97 @@
+"""A cause that bends within its range is judged by what it does at the size that was found."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+from curve_simulation import TIME, CurveSimulation, Force, curve_record
+
+from sliceit_drake.diagnosis.causes.material import SlicePushLaw
+from sliceit_drake.diagnosis.evidence.at_size import ROUNDS, AtSize
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.verdict import Verdict, reach_verdict
+
+DRAWS = {"press": 0.0, "draw_1": 1.0, "draw_2": 2.0}
+COLUMN = Column("cause", "slice_push_law", "exponent", size=0.25, low=-1.0, high=2.0)
+OTHERS = [Column("base", "material.toughness", size=0.05), Column("cause", "skin", "toughness")]
+
+
+def force(condition: str, exponent: float) -> np.ndarray:
+    """Work by area, helped by the draw less or more than that says."""
+    xi = DRAWS[condition]
+    texture = 1.0 + 0.1 * np.sin(20.0 * TIME)
+    return 8.0 * (1.0 + xi**2) ** -(1.0 + exponent) * texture * np.minimum(TIME / 0.3, 1.0)
+
+
+def problem_of(hidden: float, column: Column = COLUMN) -> LinearProblem:
+    """Records of a hidden exponent, beside a toughness of all and a skin."""
+    skin = np.exp(-(((TIME - 0.2) / 0.1) ** 2))
+    records = []
+    for condition in DRAWS:
+        for k in range(3):
+            r = curve_record(force, column, condition, k, hidden)
+            more = np.stack([0.05 * r.predicted[:, 0], skin], axis=1)[:, None]
+            columns = np.concatenate([r.columns, more], axis=2)
+            even = np.concatenate([r.even, np.zeros_like(more)], axis=2)
+            records.append(dc.replace(r, columns=columns, even=even))
+    return LinearProblem(Sensitivities([column, *OTHERS], records))
+
+
+def judged(
+    hidden: float, column: Column = COLUMN, simulated: Force = force
+) -> tuple[LinearProblem, Verdict, CurveSimulation]:
+    problem = problem_of(hidden, column)
+    simulation = CurveSimulation(problem.found.records, simulated)
+    at_size = AtSize(simulation, {"slice_push_law": SlicePushLaw()})
+    return problem, reach_verdict(problem, 60, at_size=at_size), simulation
+
+
+def value(verdict: Verdict) -> float:
+    e = verdict.screening.evidence("slice_push_law")
+    return e.coefficients[0] * e.columns[0].size
+
+
+def test_an_exponent_that_derivatives_put_out_of_range_is_found_in_it():
+    problem, after, _ = judged(-0.8)
+    before = reach_verdict(problem, 60)
+    assert before.names == [] and value(before) < -1.0
+    assert after.names == [["slice_push_law"]]
+    assert value(after) == pytest.approx(-0.8, abs=0.1)
+    assert after.screening.evidence("slice_push_law").gain > before.screening.causes[0].gain
+    # A later step of the diagnosis goes on from what was seen there.
+    e = after.findings[0].evidence
+    own = after.problem.found.of_causes([e.cause])
+    for record in after.problem.found.records:
+        predicted = record.predicted + record.columns[:, :, own] @ e.coefficients
+        truth = force(record.condition, -0.8)
+        assert np.abs(predicted[:, 0] - truth).max() < 0.05 * truth.max()
+
+
+def test_what_is_beyond_the_range_is_refused_and_seen_no_farther_than_its_end():
+    column = Column("cause", "slice_push_law", "exponent", size=0.25, low=-0.5, high=2.0)
+    _, after, simulation = judged(-0.8, column)
+    assert after.names == []
+    assert after.causes[0].why == "exponent would be at a bound"
+    values = [a.values["exponent"] for p in simulation.points for a in p.causes]
+    assert min(values) == pytest.approx(-0.5)
+
+
+def test_what_is_small_or_absent_is_simulated_no_more_and_the_rest_a_few_times():
+    for hidden in (0.0, 0.1):
+        problem, after, simulation = judged(hidden)
+        assert simulation.points == [] and after.problem is problem
+    assert judged(0.0)[1].kind == "nothing"
+    _, _, simulation = judged(-0.8)
+    assert 1 <= sum(bool(p.causes) for p in simulation.points) <= ROUNDS
+
+
+def test_a_slice_that_breaks_down_there_keeps_its_derivatives():
+    def breaks(condition: str, exponent: float) -> np.ndarray:
+        whole = force(condition, exponent)
+        return whole * np.nan if exponent and condition == "draw_2" else whole
+
+    problem, verdict, _ = judged(-0.8, simulated=breaks)
+    for before, after in zip(problem.found.records, verdict.problem.found.records, strict=True):
+        same = np.array_equal(before.columns, after.columns)
+        assert same == (before.condition != "draw_1")
