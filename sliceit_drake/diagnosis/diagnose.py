@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError
@@ -48,6 +49,8 @@ def setup_of_food(
     )
 
 
+# Threads of the linear algebra only wait for each other: its matrices are small.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def diagnose(
     setup: CalibrationSetup,
     records: Sequence[SliceRecord],

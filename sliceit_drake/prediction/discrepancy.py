@@ -18,11 +18,13 @@ Woodbury's identity: with Gram matrices G = [X Z]' N^-1 [X Z] of columns X and s
 coefficients of variance D leave G - G[:, Z] (G[Z, Z] + D^-1)^-1 G[Z, :].
 """
 
+import copy
 import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri, dtrtrs
 from scipy.optimize import minimize
 
 __all__ = [
@@ -208,27 +210,28 @@ class Weighted:
     def __init__(self, problem: "Discrepancy", grams: Sequence[np.ndarray], sizes: Sizes) -> None:
         self.problem = problem
         Z, X = problem.shapes, problem.others
-        self.log_det, n, z = 0.0, len(X), len(Z)
+        n, z = len(X), len(Z)
         self.deviations = sizes.deviations(problem.channel, problem.phase)
-        D = self.deviations[3]
+        D, G = self.deviations[3], np.array(grams)
         self.scales = [of[:, None] * self.deviations[:3] for of in problem.factors]
-        self.of_condition: list[np.ndarray] = []
-        self.weights: list[np.ndarray] = []
+        GZ = D[:, None] * G[:, Z]
+        self.roots = np.linalg.cholesky(np.eye(z) + GZ[:, :, Z] * D)
+        self.log_det = 2.0 * float(np.log(np.diagonal(self.roots, 0, 1, 2)).sum())
+        self.solved = np.array(
+            [dtrtrs(L, B, lower=1)[0] for L, B in zip(self.roots, GZ, strict=True)]
+        )
+        self.of_condition = G - self.solved.transpose(0, 2, 1) @ self.solved
+        # What all conditions share goes by their factors, and by the deviations alike in all.
+        F, wide = np.array(problem.factors), self.deviations[:3].ravel()
+        A = self.of_condition.reshape(len(G), -1)
+        N = G.shape[1]
+        pairs = ((F[:, :, None] * F[:, None]).reshape(len(G), 9).T @ A).reshape(3, 3, N, N)
+        single = (F.T @ A).reshape(3, N, N)
         shared = np.zeros((3 * z + n, 3 * z + n))
-        for G, scale in zip(grams, self.scales, strict=True):
-            inner = np.eye(z) + D[:, None] * G[np.ix_(Z, Z)] * D
-            factor = cho_factor(inner, lower=True, check_finite=False)
-            self.log_det += 2.0 * float(np.log(np.diag(factor[0])).sum())
-            GZ = D[:, None] * G[Z]
-            weights = D[:, None] * cho_solve(factor, GZ, check_finite=False)
-            A = G - G[:, Z] @ weights
-            self.of_condition.append(A)
-            self.weights.append(weights)
-            ZZ, ZX = A[np.ix_(Z, Z)], A[np.ix_(Z, X)]
-            flat = scale.ravel()
-            shared[: 3 * z, : 3 * z] += flat[:, None] * np.tile(ZZ, (3, 3)) * flat
-            shared[: 3 * z, 3 * z :] += flat[:, None] * np.tile(ZX, (3, 1))
-            shared[3 * z :, 3 * z :] += A[np.ix_(X, X)]
+        among = pairs[:, :, Z][:, :, :, Z].transpose(0, 2, 1, 3).reshape(3 * z, 3 * z)
+        shared[: 3 * z, : 3 * z] = wide[:, None] * among * wide
+        shared[: 3 * z, 3 * z :] = wide[:, None] * single[:, Z][:, :, X].reshape(3 * z, n)
+        shared[3 * z :, 3 * z :] = self.of_condition.sum(0)[np.ix_(X, X)]
         shared[3 * z :, : 3 * z] = shared[: 3 * z, 3 * z :].T
         self.shared, self.size = shared, 3 * z
         inner = np.eye(3 * z) + shared[: 3 * z, : 3 * z]
@@ -279,7 +282,9 @@ class Weighted:
             [e, k].
         """
         Z, X, s = self.problem.shapes, self.problem.others, self.size
-        left = rows - rows[:, Z] @ self.weights[condition]
+        D, L = self.deviations[3], self.roots[condition]
+        weights = D[:, None] * dtrtrs(L, self.solved[condition], lower=1, trans=1)[0]
+        left = rows - rows[:, Z] @ weights
         scaled = np.tile(left[:, Z], 3) * self.scales[condition].ravel()
         fitted = cho_solve(self.factor, self.shared[:s, s:] @ columns, check_finite=False)
         return np.asarray(left[:, X] @ columns - scaled @ fitted)
@@ -288,13 +293,16 @@ class Weighted:
         """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
         `products` but with nothing else projected out."""
         Z, D = self.problem.shapes, self.deviations[3]
-        B = self.shared[: self.size, : self.size]
-        out = [np.diag(B) - np.einsum("ij,ji->i", B, cho_solve(self.factor, B))]
+        # With P the inverse of E + B, E nearly 1, B - B P B has the diagonal of E - E P E.
+        P, _ = dpotri(self.factor[0], lower=1)
+        P = np.tril(P) + np.tril(P, -1).T
+        E = 1.0 + JITTER * (1.0 + np.diag(self.shared)[: self.size])
+        out = [E - E * np.diag(P) * E]
+        blocks = P.reshape(3, len(Z), 3, len(Z))
         for A, scale in zip(self.of_condition, self.scales, strict=True):
             ZZ = A[np.ix_(Z, Z)] * D
-            right = scale.ravel()[:, None] * np.tile(ZZ, (3, 1))
-            inner = np.einsum("ij,ij->j", right, cho_solve(self.factor, right))
-            out.append(D * np.diag(ZZ) - inner)
+            among = np.einsum("az,azby,by->zy", scale, blocks, scale, optimize=True)
+            out.append(D * np.diag(ZZ) - np.einsum("ij,ij->j", ZZ, among @ ZZ))
         return out
 
 
@@ -347,8 +355,8 @@ class Discrepancy:
             fitted: Columns that are fitted, as numbers in `others` [k].
             prior: Precisions of their coefficients; 0 where nothing is known [k].
         """
-        W = Weighted(self, grams, sizes)
-        T, y, k = W.total, len(self.others) - 1, list(fitted)
+        W = self._weighted(grams, sizes, fitted)
+        T, y, k = W.total, len(fitted), list(range(len(fitted)))
         inner = T[np.ix_(k, k)] + np.diag(prior)
         scale = np.sqrt(np.maximum(np.diag(inner), 1e-30))
         values, vectors = np.linalg.eigh(inner / np.outer(scale, scale))
@@ -361,7 +369,7 @@ class Discrepancy:
         # Flat columns have no scale of their own: their determinant is as in the first model.
         log_det += 2.0 * float(np.log(scale[~proper]).sum())
         value = -0.5 * (log_det + T[y, y] - float(seen @ seen))
-        columns = np.zeros((len(self.others), len(root.T) + 1))
+        columns = np.zeros((y + 1, len(root.T) + 1))
         columns[k, :-1] = root
         columns[y, -1], columns[k, -1] = 1.0, -root @ seen
         shares = []
@@ -371,6 +379,16 @@ class Discrepancy:
         gradient = self._by_size(by_shape)
         away = (sizes.flat - self.prior.flat) / self.spread
         return value - 0.5 * float(away @ away), gradient - away / self.spread
+
+    def _weighted(
+        self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int]
+    ) -> Weighted:
+        """Moments of the fitted columns and the residual alone, in this order."""
+        z = len(self.shapes)
+        kept = [*self.shapes, *(self.others[k] for k in fitted), self.others[-1]]
+        some = copy.copy(self)
+        some.shapes, some.others = list(range(z)), list(range(z, len(kept)))
+        return Weighted(some, [G[np.ix_(kept, kept)] for G in grams], sizes)
 
     def _by_size(self, by_shape: np.ndarray) -> np.ndarray:
         """Sums of what belongs to shapes [4, z] by the size that it belongs to."""
