@@ -271,6 +271,25 @@ def test_a_network_corrects_the_rule_by_what_it_may():
     assert found["both"] == pytest.approx([1.0, -0.25, 0.95, 0.1, 0.75, -0.05])
 
 
+def test_the_rule_presses_harder_while_the_knife_comes_no_lower():
+    def place(time):
+        """On its way down it stays from 1 to 2 s, up and down by 0.1 mm, as where a draw turns."""
+        stays = min(max(time - 1.0, 0.0), 1.0)
+        return 0.0, 0.01 * (time - stays) + 1e-4 * np.sin(30.0 * stays), 0.0
+
+    rule = AgentRule(10.0, gain=1.0, softness=0.0, reach=0.0, approach=0.0, patience=0.5)
+    simulator, agent = agent_of(
+        place, AgentConfig(rule=rule), wrench=lambda _: [0, 0, 0, 0, 0, -5.0]
+    )
+    presses = {}
+    for time in (0.9, 1.53, 1.98, 2.4):
+        simulator.AdvanceTo(time)
+        presses[time] = observed(simulator, agent)["last_press"]
+    # It has waited for half a second, which doubles the level, and for nearly one.
+    level = {0.9: 10.0, 1.53: 20.0, 1.98: 29.0, 2.4: 10.0}
+    assert presses == {t: pytest.approx(1.0 - 5.0 / N, abs=0.03) for t, N in level.items()}
+
+
 def test_an_action_beyond_its_range_counts_as_the_nearest_within():
     simulator, agent = agent_of(at_rest(), decide=lambda _: np.array([0, 0, 0, 0, 5.0, -3.0]))
     simulator.AdvanceTo(0.01)

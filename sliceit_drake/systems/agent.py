@@ -32,7 +32,7 @@ from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValue
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.systems.agent_rule import AgentRule
+from sliceit_drake.systems.agent_rule import PROGRESS, AgentRule
 from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.policy import envelope, envelope_time
 
@@ -239,6 +239,8 @@ class AgentSystem(PlainSystem):
         self._at_goal = self.DeclareDiscreteState(1)
         # When the slice ended and the target began to rise; negative before.
         self._lift_time = self.DeclareDiscreteState([-1.0])
+        # Least height over the board, by steps of `PROGRESS`, and the time since it was reached.
+        self._lowest = self.DeclareDiscreteState([config.descent, 0.0])
         # The oldest of the readings is dropped when the newest is taken, so one fewer is kept.
         self._readings = self.DeclareDiscreteState(np.zeros(3 * (config.history - 1)))
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
@@ -327,6 +329,10 @@ class AgentSystem(PlainSystem):
             if count > config.goal_decisions:
                 discrete_state.set_value(self._lift_time, [context.get_time()])
                 discrete_state.set_value(self._place, [-error[0], config.descent - error[1]])
+        lowest, waited = self._value(context, self._lowest)
+        lower = error[1] <= lowest - PROGRESS
+        waits = [error[1], 0.0] if lower else [lowest, waited + config.period]
+        discrete_state.set_value(self._lowest, waits)
         before = self._value(context, self._errors)
         discrete_state.set_value(self._errors, np.concatenate([error, before[:6]]))
 
@@ -379,7 +385,10 @@ class AgentSystem(PlainSystem):
         place = self._value(context, self._offset)[0] / max(self._config.draw, 1e-9)
         way = self._value(context, self._action)[ACTIONS.index("draw")]
         speed = (self._value(context, self._errors)[1] - error[1]) / self._config.period
-        return rule.action(float(error[1]), float(speed), force, float(place), float(way))
+        waited = self._value(context, self._lowest)[1]
+        return rule.action(
+            float(error[1]), float(speed), force, float(place), float(way), float(waited)
+        )
 
     def _target(self, context: Context) -> np.ndarray:
         """The target's place from the start, along Kx and Kz [2], m."""

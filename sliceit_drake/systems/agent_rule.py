@@ -6,7 +6,7 @@ import numpy as np
 
 from sliceit_drake.configuration import quantity
 
-__all__ = ["AgentRule"]
+__all__ = ["PROGRESS", "AgentRule"]
 
 LANDING = 4e-3
 """Height over the board within which level and draw fall, metres. A draw tilts the knife as it
@@ -16,6 +16,8 @@ CREEP = 5e-3
 STUCK, SETTLED = 0.6, 2e-4
 """Least fraction of the level where the knife creeps and is this high over the board, m: some foods
 hold it by more than is left of the level there."""
+PROGRESS = 5e-4
+"""Way down that ends a wait, m."""
 BRAKE = 200.0
 """Of the press on what is more than the speed that it may have, s/m."""
 
@@ -40,9 +42,18 @@ class AgentRule:
     """Least time to the board at the speed that it has; 0 for no limit."""
     correction: float = quantity(0.5, "", low=0.0, high=2.0)
     """Most by which a network changes each of its actions."""
+    patience: float = quantity(0.0, "s", low=0.0, high=100.0)
+    """Time without way down in which the level doubles, once more in each such time; 0 for never.
+    Food that asks for more than the level would hold the knife for ever."""
 
     def action(
-        self, height: float, speed: float, force: float, place: float, way: float
+        self,
+        height: float,
+        speed: float,
+        force: float,
+        place: float,
+        way: float,
+        waited: float = 0.0,
     ) -> np.ndarray:
         """The action [6].
 
@@ -52,13 +63,16 @@ class AgentRule:
             force: Felt force, N.
             place: Target along the edge, over the farthest draw.
             way: Action of the draw before.
+            waited: Time since it last came lower than ever by `PROGRESS`, s.
         """
-        height = max(height, 0.0)
+        height, level = max(height, 0.0), self.level
+        if self.patience > 0.0 and height > SETTLED:
+            level *= 1.0 + waited / self.patience
         near = height / LANDING
         left = min(1.0, self.landing + near)
         if speed < CREEP and height > SETTLED:
             left = max(left, STUCK)
-        push = self.gain * (1.0 - force / (self.level * left))
+        push = self.gain * (1.0 - force / (level * left))
         softness, draw = self.softness + push, self.draw(place, way) * min(1.0, self.calm + near)
         if self.approach > 0.0:
             push -= BRAKE * max(speed - CREEP - height / self.approach, 0.0)
