@@ -27,6 +27,7 @@ from sliceit_drake.learning.reward import (  # noqa: E402
 )
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig, make_agent_station  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
+from sliceit_drake.systems.agent_rule import AgentRule  # noqa: E402
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig  # noqa: E402
 
 PRESS = np.array([0.2, 0.1, 1.0, 0.3, 0.4, 1.0])
@@ -469,3 +470,22 @@ def test_a_task_without_variation_is_one_bench():
 
 def test_no_training_cuts_a_carrot_by_default():
     assert TaskConfig().foods == ["cucumber", "tomato", "potato"]
+
+
+@pytest.mark.second_tier
+def test_food_that_asks_for_more_than_a_rules_level_is_cut_by_one_that_does_not_wait_for_ever():
+    rule, task = AgentRule(16.0), TaskConfig()
+    agent = dc.replace(task.agent, draw_increment=7.5e-3, press_increment=6e-3, rule=rule)
+    env = SlicingEnv(dc.replace(task, agent=agent))
+    ends = {}
+    # A potato that is tougher than most, of the same draw for both.
+    for rule.patience in (0.0, 0.5):
+        env.reset(seed=2_000_008, options={"food": "potato"})
+        for _ in range(160):
+            info = env.step(np.zeros(6))[-1]
+            if "end" in info:
+                break
+        ends[rule.patience] = info.get("end"), info["height"]
+    assert ends[0.0][0] is None and ends[0.0][1] > 1e-3
+    assert ends[0.5][0] == "goal"
+    env.close()
