@@ -382,7 +382,7 @@ def test_what_adheres_grows_with_the_root_of_the_speed_where_its_exponent_is_a_h
     assert adhesion.steepest == pytest.approx(0.01**-0.25)
 
 
-@pytest.mark.parametrize("exponent", [0.6, 1.5])
+@pytest.mark.parametrize("exponent", [0.0, 0.6, 1.5])
 @pytest.mark.parametrize("ratio", [0.0, 1.0, 3.0])
 def test_the_force_of_a_draw_has_the_exponent(exponent, ratio):
     result = simulate(bar(), Effects(slice_push=SlicePush(exponent)), press(0.014, ratio))
@@ -392,7 +392,7 @@ def test_the_force_of_a_draw_has_the_exponent(exponent, ratio):
     assert -force[0] == pytest.approx(ratio * expected, rel=0.02, abs=0.01 * expected)
 
 
-@pytest.mark.parametrize("exponent", [0.5, 1.0])
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0])
 def test_an_edge_on_its_way_out_cuts_nothing_whatever_the_exponent(exponent):
     result = simulate(
         bar(),
@@ -610,7 +610,7 @@ WRONG = {
     "{bluntness: {slices: 1.5}}": "bluntness.slices",
     "{bluntness: {depth: 0}}": "bluntness.depth",
     "{adhesion: {stress: -5}}": "adhesion.stress",
-    "{slice_push: {exponent: 0}}": "slice_push.exponent",
+    "{slice_push: {exponent: -0.1}}": "slice_push.exponent",
     "{compliance: {arm: 20}}": "compliance.arm",
     "{slip: {resistance: 5}}": "slip.resistance",
     "{slip: {remaining: 1.5}, compliance: {holder: 1e-5}}": "slip.remaining",
