@@ -118,7 +118,8 @@ def diagnose(
 
     def count(more: int) -> None:
         done[0] += more
-        show("bootstrap", done[0], steps)
+        # Screenings that are repeated are more than these.
+        show("bootstrap", min(done[0], steps), steps)
 
     by_name = {c.name: c for c in causes}
     at_size = AtSize(predictor, by_name, lambda done, total: show("at size", done, total))
