@@ -19,7 +19,14 @@ from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import Job, JobResult, Simulator, Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["RECORD_EFFECTS", "ActiveCause", "Point", "RecordEffect", "SlicePredictor"]
+__all__ = [
+    "RECORD_EFFECTS",
+    "ActiveCause",
+    "Point",
+    "RecordEffect",
+    "SlicePredictor",
+    "changes_at",
+]
 
 
 @dc.dataclass(frozen=True)
@@ -252,6 +259,23 @@ class SlicePredictor:
         for active in point.causes:
             seen.wrench = active.cause.wrench(seen, active.values, active.cause.visible(facts))
         return seen.wrench
+
+
+def changes_at(
+    point: Point,
+    predictor: SlicePredictor,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[np.ndarray | None]:
+    """What a point changes the prediction of each record by [m, c], N and Nm; None where its slice
+    breaks down."""
+    out: list[np.ndarray | None] = []
+    null, moved = predictor.predict([Point(), point], progress)
+    for target, *ends in zip(predictor.targets, null, moved, strict=True):
+        wrenches = [series.wrench for series in ends if series is not None]
+        seen = target.compare(np.stack(wrenches, axis=2))
+        change = seen[:, :, 1] - seen[:, :, 0]
+        out.append(change if np.isfinite(change).all() else None)
+    return out
 
 
 @dc.dataclass

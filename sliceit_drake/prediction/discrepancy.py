@@ -356,13 +356,13 @@ class Discrepancy:
             prior: Precisions of their coefficients; 0 where nothing is known [k].
         """
         W = self._weighted(grams, sizes, fitted)
-        T, y, k = W.total, len(fitted), list(range(len(fitted)))
-        inner = T[np.ix_(k, k)] + np.diag(prior)
+        T, y = W.total, len(fitted)
+        inner = T[:y, :y] + np.diag(prior)
         scale = np.sqrt(np.maximum(np.diag(inner), 1e-30))
         values, vectors = np.linalg.eigh(inner / np.outer(scale, scale))
         kept = values > 1e-9
         root = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
-        seen = root.T @ T[k, y]
+        seen = root.T @ T[:y, y]
         proper = prior > 0.0
         log_det = W.log_det + float(np.log(values[kept]).sum())
         log_det += 2.0 * float(np.log(scale[proper]).sum()) - float(np.log(prior[proper]).sum())
@@ -370,8 +370,8 @@ class Discrepancy:
         log_det += 2.0 * float(np.log(scale[~proper]).sum())
         value = -0.5 * (log_det + T[y, y] - float(seen @ seen))
         columns = np.zeros((y + 1, len(root.T) + 1))
-        columns[k, :-1] = root
-        columns[y, -1], columns[k, -1] = 1.0, -root @ seen
+        columns[:y, :-1] = root
+        columns[y, -1], columns[:y, -1] = 1.0, -root @ seen
         shares = []
         for product, trace in zip(W.products(columns), W.traces(), strict=True):
             shares.append(product[:, -1] ** 2 - trace + (product[:, :-1] ** 2).sum(1))

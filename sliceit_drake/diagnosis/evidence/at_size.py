@@ -2,13 +2,13 @@
 
 A column is a derivative over a cause's size. A law of the draw, (1 + xi^2)^-a, or a board that
 stiffens, (F / F_0)^a, bends within a few sizes, so that a straight line from null asks for an
-exponent that does not exist, and another cause may seem to explain more. Causes that gain are
-simulated at what was found, and their columns are corrected so that they give what the simulation
-did (Broyden, Math. Comp. 19, 1965).
+exponent that does not exist, and another cause may seem to explain more. A cause that gains is
+simulated at what was found, and its columns are corrected so that they give what the simulation
+did.
 """
 
 import dataclasses as dc
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
-from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor, changes_at
 
 __all__ = ["AtSize"]
 
@@ -45,38 +45,22 @@ class AtSize:
         self.predictor, self.causes, self.progress = predictor, causes, progress
         self._simulated: dict[CauseAtScan, list[np.ndarray]] = {}
 
-    def __call__(
-        self, problem: LinearProblem, found: Sequence[CauseEvidence]
-    ) -> LinearProblem | None:
-        """The problem with the columns of some causes corrected; None where none needs it: what is
+    def __call__(self, problem: LinearProblem, e: CauseEvidence) -> LinearProblem | None:
+        """The problem with the columns of a cause corrected; None where that is not needed: what is
         within a size, or was simulated near what was found."""
-        steps = {}
-        for e in found:
-            step = self._step(problem, e)
-            before = self._simulated.setdefault(e.cause, [])
-            near = before and np.linalg.norm(step - before[-1]) < CLOSE * np.linalg.norm(step)
-            if np.abs(step).max() > 1.0 and len(before) < ROUNDS and not near:
-                steps[e.cause] = step
-        if not steps:
+        step, before = self._step(problem, e), self._simulated.setdefault(e.cause, [])
+        near = before and np.linalg.norm(step - before[-1]) < CLOSE * np.linalg.norm(step)
+        if np.abs(step).max() <= 1.0 or len(before) == ROUNDS or near:
             return None
-        active = [self._active(problem, cause, step) for cause, step in steps.items()]
-        points = [Point(), *(Point(causes=(cause,)) for cause in active)]
-        null, *moved = self.predictor.predict(points, self.progress)
-        records = []
-        for r, record in enumerate(problem.found.records):
-            series = [row[r] for row in (null, *moved)]
-            wrenches = np.stack([s.wrench for s in series if s is not None], axis=2)
-            seen = self.predictor.targets[r].compare(wrenches)
-            columns = record.columns.astype(float)
-            for k, (cause, step) in enumerate(steps.items(), 1):
-                own = problem.found.of_causes([cause])
-                missed = seen[:, :, k] - seen[:, :, 0] - columns[:, :, own] @ step
-                # Of a slice that broke down the derivatives stay.
-                if np.isfinite(missed).all():
-                    columns[:, :, own] += missed[:, :, None] * step / (step @ step)
-            records.append(dc.replace(record, columns=columns))
-        for cause, step in steps.items():
-            self._simulated[cause].append(step)
+        before.append(step)
+        point = Point(causes=(self._active(problem, e.cause, step),))
+        changes = changes_at(point, self.predictor, self.progress)
+        own = problem.found.of_causes([e.cause])
+        records = [
+            # Of a slice that broke down the derivatives stay.
+            record if change is None else record.corrected(own, step, change)
+            for record, change in zip(problem.found.records, changes, strict=True)
+        ]
         return LinearProblem(
             dc.replace(problem.found, records=records), problem.noise, problem.variation
         )

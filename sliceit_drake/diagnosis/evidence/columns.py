@@ -115,6 +115,21 @@ class RecordSensitivity:
         """Number of the channel that figures and tables show."""
         return self.channels.index("force_z") if "force_z" in self.channels else 0
 
+    def corrected(
+        self, columns: Sequence[int], step: np.ndarray, change: np.ndarray
+    ) -> "RecordSensitivity":
+        """The record with columns that give what a step does (Broyden, Math. Comp. 19, 1965).
+
+        Args:
+            columns: Their numbers [n].
+            step: In their sizes, not all 0 [n].
+            change: Of the prediction by it [m, c], N and Nm.
+        """
+        out = self.columns.astype(float)
+        missed = change - out[:, :, columns] @ step
+        out[:, :, columns] += missed[:, :, None] * step / float(step @ step)
+        return dc.replace(self, columns=out)
+
     def kinks(self) -> np.ndarray:
         """Largest second difference of the prediction within `KINK_TIME` of each row [m, c].
 

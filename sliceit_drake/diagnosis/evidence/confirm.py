@@ -132,15 +132,14 @@ def _corrected(
 ) -> LinearProblem:
     """A problem with the derivatives of the last, corrected so that they give what a step between
     the two did, in the columns' sizes [n]."""
-    square = float(step @ step)
-    if square == 0.0:
+    if not step.any():
         return moved
-    records = []
-    for before, after in zip(last.found.records, moved.found.records, strict=True):
-        changed = before.columns.astype(float)
-        missed = after.predicted - before.predicted - changed[:, :, columns] @ step
-        changed[:, :, columns] += missed[:, :, None] * step / square
-        records.append(dc.replace(after, columns=changed))
+    records = [
+        dc.replace(after, columns=before.columns).corrected(
+            columns, step, after.predicted - before.predicted
+        )
+        for before, after in zip(last.found.records, moved.found.records, strict=True)
+    ]
     found = dc.replace(moved.found, records=records)
     return LinearProblem(found, moved.noise, moved.variation)
 

@@ -14,7 +14,7 @@ from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
-from sliceit_drake.diagnosis.prediction import Point, SlicePredictor
+from sliceit_drake.diagnosis.prediction import Point, SlicePredictor, changes_at
 
 __all__ = ["at_own_values"]
 
@@ -73,14 +73,7 @@ def _simulated(
         }
         for target, row in zip(predictor.targets, values, strict=True)
     }
-    mean, moved = predictor.predict([Point(), Point(records=own)], progress)
-    out: list[np.ndarray | None] = []
-    for target, *ends in zip(predictor.targets, mean, moved, strict=True):
-        wrenches = [series.wrench for series in ends if series is not None]
-        seen = target.compare(np.stack(wrenches, axis=2))
-        change = seen[:, :, 1] - seen[:, :, 0]
-        out.append(change if np.isfinite(change).all() else None)
-    return out
+    return changes_at(Point(records=own), predictor, progress)
 
 
 def _moved(

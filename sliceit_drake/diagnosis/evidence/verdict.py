@@ -40,8 +40,6 @@ OF_THE_BOARD = ("board_height", "board_stiffness")
 measured, and then seems to be of another stiffness as well."""
 HALF = 0.5
 """Least share of the simulation's own error that a cause can do which is said to be near."""
-SEEN_AT_SIZE = 1
-"""Causes that gain most, which are seen at the size that is found."""
 LAW = "law"
 """Name of the simulation's own law in a group."""
 
@@ -206,12 +204,12 @@ def reach_verdict(
         assumed = [e.cause for e in (*(f.evidence for f in findings), *aside)]
         screening = screen(problem, replicates, seed + len(findings), assumed, progress)
         if at_size is not None and screening.p_value <= rule.alarm:
-            gaining = sorted(screening.causes, key=lambda e: -e.gain)[:SEEN_AT_SIZE]
-            shared = [e for e in gaining if e.score > 0.0 and not e.per_record]
-            corrected = at_size(problem, shared)
-            if corrected is not None:
-                problem = corrected
-                continue
+            first = max(screening.causes, key=lambda e: e.gain)
+            if first.score > 0.0 and not first.per_record:
+                corrected = at_size(problem, first)
+                if corrected is not None:
+                    problem = corrected
+                    continue
         screenings.append(screening)
         # Beside what is only set aside nothing is excluded.
         if not aside:
