@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from example_slices import example_slice
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.diagnosis import diagnose as diagnosis_module
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter
@@ -333,3 +335,17 @@ def test_a_motion_of_the_wrong_shape_is_refused():
 
     with pytest.raises(ConfigurationError, match="gives arrays"):
         dry_run(Cut())
+
+
+def test_a_diagnosis_keeps_the_linear_algebra_to_one_thread(monkeypatch):
+    seen = []
+
+    def check(*_):
+        seen.extend(i["num_threads"] for i in threadpool_info() if i["user_api"] == "blas")
+        raise ConfigurationError("enough")
+
+    monkeypatch.setattr(diagnosis_module, "check_records", check)
+    setup = diagnosis_module.setup_of_food(load_calibrated_food("cucumber"))
+    with threadpool_limits(2, "blas"), pytest.raises(ConfigurationError, match="enough"):
+        diagnosis_module.diagnose(setup, slices())
+    assert set(seen) == {1}

@@ -124,8 +124,12 @@ def test_a_program_that_ends_while_kernels_load_ends_without_a_traceback():
         "def load(name, **_):\n"
         "    time.sleep(0.2)\n"
         "    os.write(1, name.encode())\n"
+        "def names():\n"
+        "    for name in 'abc':\n"
+        "        time.sleep(0.1)\n"  # For a thread of its own, long enough to be overtaken.
+        "        yield name\n"
         "warp.load_module = load\n"
-        "start_loading(['a', 'b', 'c'], 'cpu')\n"
+        "start_loading(names(), 'cpu')\n"
         "raise SystemExit(3)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
