@@ -208,6 +208,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "slicing", "learning.comparison", "policies of both simulators in unseen worlds", "5 s"
         ),
         Study(
+            "foreign_law",
+            "learning.foreign_law",
+            "policies in a law of the benches",
+            "10 min",
+        ),
+        Study(
             "fronts",
             "learning.fronts",
             "force against time of policies, rules and chance",

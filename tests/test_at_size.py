@@ -9,8 +9,11 @@ from curve_simulation import TIME, CurveSimulation, Force, curve_record
 from sliceit_drake.diagnosis.causes.material import SlicePushLaw
 from sliceit_drake.diagnosis.evidence.at_size import ROUNDS, AtSize
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
+from sliceit_drake.diagnosis.evidence.confirm import Confirmation
+from sliceit_drake.diagnosis.evidence.held_out import held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.verdict import Verdict, reach_verdict
+from sliceit_drake.diagnosis.result import Diagnosis
 
 DRAWS = {"press": 0.0, "draw_1": 1.0, "draw_2": 2.0}
 COLUMN = Column("cause", "slice_push_law", "exponent", size=0.25, low=-1.0, high=2.0)
@@ -95,3 +98,29 @@ def test_a_slice_that_breaks_down_there_keeps_its_derivatives():
     for before, after in zip(problem.found.records, verdict.problem.found.records, strict=True):
         same = np.array_equal(before.columns, after.columns)
         assert same == (before.condition != "draw_1")
+
+
+@pytest.fixture
+def result() -> Diagnosis:
+    _, verdict, _ = judged(-0.8)
+    problem, cause = verdict.problem, SlicePushLaw()
+    gain = held_out_gain(problem, verdict.named)
+    return Diagnosis(verdict, problem, None, {cause.name: cause}, {}, gain, [])
+
+
+def test_a_number_that_simulations_take_to_a_bound_refutes_its_cause(result):
+    values = {"slice_push_law": {"exponent": -0.8, "pull": 0.0}}
+    result.confirmation = Confirmation(result.problem, values, {}, 1.0, 1.0)
+    assert result.refuted() == {}
+    values["slice_push_law"]["exponent"] = -1.0
+    assert result.refuted() == {"slice_push_law": "a simulation takes exponent to a bound"}
+
+
+def test_a_file_that_clearly_predicts_left_out_records_worse_refutes_its_cause(result):
+    assert result.gain.interval[0] > 0.0 and result.refuted() == {}
+    result.gain = dc.replace(result.gain, interval=(-0.5, 0.1))
+    assert result.refuted() == {}
+    result.gain = dc.replace(result.gain, interval=(-0.5, -0.1))
+    assert list(result.refuted()) == ["slice_push_law"]
+    result.verdict.kind = "unknown"
+    assert result.refuted() == {}

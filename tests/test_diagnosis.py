@@ -52,6 +52,25 @@ def test_noise_is_that_of_replicates_whatever_the_model_gets_wrong():
         assert noise.tau == pytest.approx(-3.0 / (ROWS - 1) / np.log(0.9), rel=0.5)
 
 
+def test_a_problem_with_other_columns_is_that_which_is_made_anew():
+    whole = problem(3, rate=1.0)
+    rate = whole.found.index("cause", "rate")
+    whole.fitted_sizes(rate)
+    records = []
+    for r in whole.found.records:
+        columns = r.columns.copy()
+        columns[:, :, rate] *= 1.0 + r.depth[:, None, None] / r.depth.max()
+        records.append(dc.replace(r, columns=columns))
+    corrected = whole.correcting(records, rate)
+    found = dc.replace(whole.found, records=records)
+    anew = LinearProblem(found, whole.noise, whole.variation)
+    np.testing.assert_allclose(corrected.moments.gram, anew.moments.gram, rtol=1e-9)
+    np.testing.assert_allclose(corrected.moments.force_gram, anew.moments.force_gram, rtol=1e-9)
+    for causes in ([], rate):
+        assert corrected.fitted_sizes(causes)[1] == pytest.approx(anew.fitted_sizes(causes)[1])
+    assert whole.fitted_sizes(rate)[1] != pytest.approx(corrected.fitted_sizes(rate)[1])
+
+
 def test_the_weights_of_a_channel_are_the_inverse_of_its_covariance():
     noise = ChannelNoise(0.3, 0.2, 0.1)
     time = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.1, 40))
@@ -146,11 +165,22 @@ def test_a_cause_that_stands_for_one_at_its_bound_is_not_named():
     why = {c.name: c.why for c in verdict.causes}
     assert not verdict.names
     assert why["rate"] == "exponent would be at a bound"
-    assert "beside rate, whose" in why["skin"]
+    assert why["skin"].endswith("beside rate: exponent would be at a bound")
 
 
 def test_a_cause_is_named_beside_one_at_its_bound_where_it_gains_by_itself():
     assert reach_verdict(bounded(False), 60).names == [["skin"]]
+
+
+def test_a_cause_that_simulations_refute_is_not_named_nor_one_that_stands_for_it():
+    for problem in (bounded(True), bounded(False)):
+        rate = [c.name for c in problem.found.columns].index("rate")
+        problem.found.columns[rate] = dc.replace(problem.found.columns[rate], low=-9.0, high=9.0)
+        assert ["rate"] in reach_verdict(problem, 60).names
+    assert reach_verdict(bounded(True), 60, refuted={"rate": "no"}).names == []
+    verdict = reach_verdict(problem, 60, refuted={"rate": "at a bound"})
+    assert verdict.names == [["skin"]]
+    assert next(c for c in verdict.causes if c.name == "rate").why == "at a bound"
 
 
 def test_what_a_cause_at_its_bound_does_is_no_own_error_that_hides_another():

@@ -9,7 +9,6 @@ import dataclasses as dc
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.model import GRAVITY
@@ -62,12 +61,21 @@ class SensorErrors:
         """What is shown [N, 6] of moments and forces in K [N, 6] at even times [N], s."""
         out = (wrench_K.reshape(-1, 2, 3) @ self.matrix().T).reshape(-1, 6)
         share = filter_share(self, float(time[1] - time[0]))
+        keep = 1.0 - share
         for _ in range(self.delay_stages if share < 1.0 else 0):
-            keep = 1.0 - share
-            out, _ = lfilter([share], [1.0, -keep], out, axis=0, zi=keep * out[:1])
+            out = _filtered(share, out, keep * out[:1])
         since = (time - time[0])[:, None]
         out[:, 3:] += np.array(self.force_bias) + since * np.array(self.force_drift_rate)
         return np.asarray(out)
+
+
+def _filtered(share: float, values: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """Each value and what is left of those before it [N, ...], from a state of the filter [1, ...];
+    see `scipy.signal.lfilter`."""
+    # Takes a second to load, and a bench without errors needs none.
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=0, zi=state)[0])
 
 
 def filter_share(sensor: SensorErrors, period: float) -> float:
@@ -145,7 +153,7 @@ class ArmErrors:
         stiffness = np.where(height < 0.0, pressed / np.maximum(-height, 1e-9), 0.0)
         keep = np.exp(-period / self.creep_time)
         crept = self.creep * pressed / (1.0 + self.creep * stiffness)
-        rise = lfilter([1.0 - keep], [1.0, -keep], crept)
+        rise = _filtered(1.0 - keep, crept, np.zeros(1))
         if not food:
             given = self.compliance * stiffness
             rise = rise + np.where(height < 0.0, -height * given / (1.0 + given), 0.0)

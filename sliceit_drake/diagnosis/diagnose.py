@@ -123,20 +123,25 @@ def diagnose(
 
     by_name = {c.name: c for c in causes}
     at_size = AtSize(predictor, by_name, lambda done, total: show("at size", done, total))
-    verdict = reach_verdict(problem, replicates, seed, count, at_size=at_size)
-    show("bootstrap", steps, steps)
-    result = Diagnosis(
-        verdict=verdict,
-        problem=verdict.problem,
-        setup=setup,
-        causes=by_name,
-        shifts=_shifts(verdict.problem, verdict.named),
-        gain=None,
-        remarks=remarks,
-    )
-    if verdict.names:
-        result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
-    return result
+    refuted: dict[str, str] = {}
+    while True:
+        verdict = reach_verdict(problem, replicates, seed, count, at_size=at_size, refuted=refuted)
+        show("bootstrap", steps, steps)
+        problem = verdict.problem
+        result = Diagnosis(
+            verdict=verdict,
+            problem=problem,
+            setup=setup,
+            causes=by_name,
+            shifts=_shifts(problem, verdict.named),
+            gain=None,
+            remarks=list(remarks),
+        )
+        if verdict.names:
+            result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
+        if not (found_wrong := result.refuted()):
+            return result
+        refuted |= found_wrong
 
 
 def _shifts(

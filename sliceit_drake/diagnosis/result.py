@@ -92,6 +92,24 @@ class Diagnosis:
             named = [f.evidence.cause for f in held]
             self.gain = held_out_gain(self.problem, named, seed, self.extension)
 
+    def refuted(self) -> dict[str, str]:
+        """Named causes that simulations do not bear out, by name, with the reason: a number ends at
+        a bound, or the extended food clearly predicts records that were left out worse, which is
+        laid to the cause with least evidence."""
+        named = self.verdict.findings if self.verdict.names else []
+        shared = [f for f in named if not f.evidence.per_record]
+        out = {}
+        for f in shared:
+            values, cause = self.values(f), self.causes[f.evidence.name]
+            for c in f.evidence.columns:
+                away = values[c.parameter] - cause.parameter(c.parameter).null
+                if away != 0.0 and not c.low < away < c.high:
+                    out[cause.name] = f"a simulation takes {c.parameter} to a bound"
+        if not out and shared and self.gain is not None and self.gain.interval[1] <= 0.0:
+            weakest = min(shared, key=lambda f: f.evidence.gain)
+            out[weakest.evidence.name] = "its file predicts records that were left out worse"
+        return out
+
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""
         e, cause = finding.evidence, self.causes[finding.evidence.name]

@@ -109,19 +109,18 @@ def evaluate(
                     progress(count)
 
 
-def cut(case: Case) -> dict:
-    """Cuts one slice; returns its row."""
+def cut(case: Case, world: SlicingWorld | None = None) -> dict:
+    """Cuts one slice, in the world that it names or in another; returns its row."""
     _, _, simulator, seed = _policy(case.policy)
-    metrics = dc.asdict(trace(case).metrics)
+    metrics = dc.asdict(trace(case, world).metrics)
     return dc.asdict(case) | {"simulator": simulator, "policy_seed": seed} | metrics
 
 
-def trace(case: Case) -> SliceTrace:
-    """Cuts one slice."""
+def trace(case: Case, world: SlicingWorld | None = None) -> SliceTrace:
+    """Cuts one slice; see `cut`."""
     agent, decide, _, _ = _policy(case.policy)
-    scenario, make_cutting = WORLDS[case.world](case.seed).scenario(
-        case.food, case.slice, case.board_stiffness
-    )
+    world = world or WORLDS[case.world](case.seed)
+    scenario, make_cutting = world.scenario(case.food, case.slice, case.board_stiffness)
     return cut_slice(scenario, agent, decide, make_cutting)
 
 

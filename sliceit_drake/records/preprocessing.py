@@ -10,7 +10,6 @@ import dataclasses as dc
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.configuration import ConfigurationError
@@ -293,6 +292,9 @@ def _filtered(
     time: np.ndarray, values: np.ndarray, cutoff: float, order: int, zero_phase: bool
 ) -> np.ndarray:
     """A Butterworth filter along the rows, which starts as if the first value had always been."""
+    # Takes a second to load, and most records are not filtered.
+    from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt
+
     period = float(np.median(np.diff(time)))
     if not 0.0 < cutoff < 0.5 / period:
         raise ConfigurationError(

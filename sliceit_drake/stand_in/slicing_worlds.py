@@ -27,6 +27,7 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_cal
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
+from sliceit_drake.diagrams.prepared_food import CuttableFood
 from sliceit_drake.diagrams.scenario import Placement, Scenario, Start
 from sliceit_drake.stand_in.curve_cutter import CurveFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
@@ -38,6 +39,7 @@ __all__ = [
     "StandInWorld",
     "WorldSlice",
     "paper_slices",
+    "slice_size",
 ]
 
 PAPER_SLICES = {"cucumber": 15, "tomato": 5, "potato": 10, "carrot": 5}
@@ -87,7 +89,7 @@ class WorldSlice(typing.NamedTuple):
     """
 
     scenario: Scenario
-    cutting: CurveFood | None
+    cutting: CuttableFood | None
 
     @property
     def food(self) -> object:
@@ -98,6 +100,15 @@ class WorldSlice(typing.NamedTuple):
 def _deviations(rng: np.random.Generator, count: int) -> np.ndarray:
     """Standard normal numbers [count], cut off at `LARGEST`."""
     return np.clip(rng.normal(size=count), -LARGEST, LARGEST)
+
+
+def slice_size(
+    calibrated: CalibratedFood, rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """Diameter of a slice, metres, and factors on its toughness and friction."""
+    diameter = _diameter(calibrated, rng)
+    tough, rub = np.exp(SPREAD * _deviations(rng, 2)).tolist()
+    return diameter, (tough, rub)
 
 
 def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
@@ -121,7 +132,7 @@ class SlicingWorld(abc.ABC):
     @abc.abstractmethod
     def _cut(
         self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
-    ) -> CurveFood | None:
+    ) -> CuttableFood | None:
         """Gives a scenario its food, or returns what is cut in its place."""
 
     def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
@@ -216,6 +227,5 @@ class CurvesWorld(SlicingWorld):
     def _cut(
         self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
     ) -> CurveFood:
-        diameter = _diameter(calibrated, rng)
-        tough, rub = np.exp(SPREAD * _deviations(rng, 2)).tolist()
+        diameter, (tough, rub) = slice_size(calibrated, rng)
         return CurveFood(calibrated.food.name, diameter, diameter, tough, rub)

@@ -7,7 +7,6 @@ simulated at what was found, and its columns are corrected so that they give wha
 did.
 """
 
-import dataclasses as dc
 from collections.abc import Mapping
 
 import numpy as np
@@ -61,9 +60,7 @@ class AtSize:
             record if change is None else record.corrected(own, step, change)
             for record, change in zip(problem.found.records, changes, strict=True)
         ]
-        return LinearProblem(
-            dc.replace(problem.found, records=records), problem.noise, problem.variation
-        )
+        return problem.correcting(records, own)
 
     def _step(self, problem: LinearProblem, e: CauseEvidence) -> np.ndarray:
         """Numbers of a cause in their range, in its columns' sizes [n]."""

@@ -140,8 +140,7 @@ def _corrected(
         )
         for before, after in zip(last.found.records, moved.found.records, strict=True)
     ]
-    found = dc.replace(moved.found, records=records)
-    return LinearProblem(found, moved.noise, moved.variation)
+    return moved.correcting(records, columns)
 
 
 def _fit(problem: LinearProblem, columns: list[int], causes: list[int]) -> tuple[np.ndarray, float]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, fit_shared, scaled_inverse
 from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
 
@@ -88,9 +88,11 @@ class OwnError:
         problem = self.problem
         out = np.zeros_like(problem.moments.gram)
         at = problem.discrepancy.others
-        for G, record, own in zip(out, problem.found.records, self.scales(), strict=True):
+        for G, record, scale in zip(
+            out, problem.found.records, _scales(problem, self), strict=True
+        ):
             columns = np.concatenate([record.columns, record.residual[:, :, None]], axis=2)
-            columns = columns / _scale(problem, record, own)[:, :, None]
+            columns = columns / scale[:, :, None]
             X = columns.reshape(-1, len(at))
             G[np.ix_(at, at)] = X.T @ X
         return out
@@ -136,10 +138,9 @@ def standardised_size(
     """
     records, base = problem.found.records, problem.base
     coefficients = np.broadcast_to(coefficients, (len(records), len(columns)))
-    scales = wrong.scales(found) if wrong is not None else [np.zeros(1)] * len(records)
+    scales = _scales(problem, wrong, found)
     effects, free = [], []
-    for record, own, g in zip(records, scales, coefficients, strict=True):
-        scale = _scale(problem, record, own)
+    for record, scale, g in zip(records, scales, coefficients, strict=True):
         effects.append((record.columns[:, :, list(columns)] @ g / scale).ravel())
         free.append((record.columns[:, :, base] / scale[:, :, None]).reshape(-1, len(base)))
     effect, X = np.concatenate(effects), np.concatenate(free)
@@ -164,9 +165,10 @@ def size_by_record(
     """
     own, base = list(columns), problem.base
     gram, effects = np.zeros((len(base) + 1, len(base) + 1)), []
-    for record, g in zip(problem.found.records, coefficients, strict=True):
+    records = zip(problem.found.records, problem.scales, coefficients, strict=True)
+    for record, scale, g in records:
         effect, error = record.columns[:, :, own] @ g, problem.model_error(record)
-        effects.append((effect / _scale(problem, record, np.zeros(1))).ravel())
+        effects.append((effect / scale).ravel())
         X = np.concatenate([record.columns[:, :, base], effect[:, :, None]], axis=2).astype(float)
         for c, noise in enumerate(problem.noise):
             gram += X[:, c].T @ noise.solve(record.time, X[:, c], error[:, c], record.near)
@@ -177,11 +179,14 @@ def size_by_record(
     return max(whitened, standardised_size(problem, columns, coefficients))
 
 
-def _scale(problem: LinearProblem, record: RecordSensitivity, own: np.ndarray) -> np.ndarray:
-    """What an effect is compared with at each row, own error of the simulation included [m, c]."""
-    return np.asarray(
-        np.hypot(np.hypot(own, problem.noise_of(record)), problem.model_error(record))
-    )
+def _scales(
+    problem: LinearProblem, wrong: OwnError | None, found: bool = False
+) -> list[np.ndarray]:
+    """What an effect is compared with at the rows of each record, own error of the simulation
+    included where one is given, each [m, c]."""
+    if wrong is None:
+        return problem.scales
+    return [np.hypot(*both) for both in zip(wrong.scales(found), problem.scales, strict=True)]
 
 
 def _acts(effect: np.ndarray) -> np.ndarray:

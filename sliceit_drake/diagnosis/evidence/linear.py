@@ -66,6 +66,8 @@ SECOND_ORDER = 0.5
 """The same of a row by what is beyond the first order of a record's own values, in that."""
 PLAUSIBLE = 2.0
 """Standard deviation of a cause's number before the data, in its size."""
+TOLERANCE = 0.1
+"""Of the gradient of the log-likelihood where sizes count as found."""
 KEPT = 4
 """Sets of reduced Gram matrices that are kept."""
 
@@ -148,6 +150,7 @@ class LinearProblem:
         else:
             self.noise, self.repeated = tuple(noise), True
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
+        self._fits: dict[tuple[int, ...], tuple[Sizes, float]] = {}
         self._make_moments()
         # In the air slices do not differ.
         cut = [g for g in self.conditions.values() if found.records[g[0]].in_contact.any()]
@@ -175,9 +178,11 @@ class LinearProblem:
         self.shapes = list(range(K, K + channels * count))
         self.size = K + channels * count
         self.forces = found.records[0].forces
+        self._errors = [self.model_error(r) for r in found.records]
+        self._calm = [self.calm(r) for r in found.records]
         grams, squares = [], np.zeros(channels + 1)
-        for record, shapes in zip(found.records, self.shape_values, strict=True):
-            grams.append(self._moments_of(record, shapes))
+        for number, record in enumerate(found.records):
+            grams.append(self._moments_of(number))
             inside = record.predicted[record.in_contact]
             squares += np.append((inside**2).sum(0), len(inside))
         self.moments = Moments(*map(np.array, zip(*grams, strict=True)))
@@ -207,13 +212,12 @@ class LinearProblem:
             X = np.column_stack([record.columns[:, c], shapes, record.residual[:, c]])
             yield c, at, X.astype(float)
 
-    def _moments_of(
-        self, record: RecordSensitivity, shapes: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    def _moments_of(self, number: int) -> tuple[np.ndarray, np.ndarray, int]:
         """Gram matrices of a record with weights and of its force without, and its rows."""
+        record, shapes = self.found.records[number], self.shape_values[number]
         gram = np.zeros((self.size + 1, self.size + 1))
         force_gram = np.zeros_like(gram)
-        error, calm = self.model_error(record), self.calm(record)
+        error, calm = self._errors[number], self._calm[number]
         for c, at, X in self._parts(record, shapes):
             G = X.T @ self.noise[c].solve(record.time, X, error[:, c], record.near)
             gram[np.ix_(at, at)] += 0.5 * (G + G.T)
@@ -222,16 +226,17 @@ class LinearProblem:
         return gram, force_gram, int(calm.sum())
 
     def _products_of(
-        self, record: RecordSensitivity, moved: RecordSensitivity, shapes: np.ndarray
+        self, number: int, now: RecordSensitivity, at: list[int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The last columns of `_moments_of` with another prediction, weights as of the record."""
-        products, of_force = np.zeros(self.size + 1), np.zeros(self.size + 1)
-        error, calm = self.model_error(record), self.calm(record)
-        for c, at, X in self._parts(moved, shapes):
-            noise, y = self.noise[c], X[:, -1:]
-            products[at] += X.T @ noise.solve(record.time, y, error[:, c], record.near)[:, 0]
+        """Some columns of `_moments_of` [K + 1, n] as a record is now, weights as they were."""
+        products, of_force = np.zeros((2, self.size + 1, len(at)))
+        error, calm = self._errors[number], self._calm[number]
+        for c, columns, X in self._parts(now, self.shape_values[number]):
+            noise, chosen = self.noise[c], np.searchsorted(columns, at)
+            changed = X[:, chosen]
+            products[columns] += X.T @ noise.solve(now.time, changed, error[:, c], now.near)
             if c in self.forces:
-                of_force[at] += X[calm].T @ X[calm, -1]
+                of_force[columns] += X[calm].T @ changed[calm]
         return products, of_force
 
     def calm(self, record: RecordSensitivity) -> np.ndarray:
@@ -242,6 +247,11 @@ class LinearProblem:
     def noise_of(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation of the noise at each row [m, c]."""
         return np.column_stack([n.deviations(record.near) for n in self.noise])
+
+    @functools.cached_property
+    def scales(self) -> list[np.ndarray]:
+        """The noise with `model_error` at the rows of each record, each [m, c]."""
+        return [np.hypot(self.noise_of(r), self.model_error(r)) for r in self.found.records]
 
     def with_noise_beside(
         self, columns: Sequence[int], coefficients: np.ndarray
@@ -255,6 +265,7 @@ class LinearProblem:
             coefficients: Of the columns in each record [R, n].
         """
         out = copy.copy(self)
+        vars(out).pop("scales", None)
         records = [
             dc.replace(r, predicted=r.predicted + r.columns[:, :, list(columns)] @ g)
             for r, g in zip(self.found.records, coefficients, strict=True)
@@ -264,21 +275,37 @@ class LinearProblem:
 
     def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
         """The same problem, weights included, about another prediction of each record [m, c]."""
+        records = [
+            dc.replace(record, predicted=values if record.bent is None else values + record.bent)
+            for record, values in zip(self.found.records, predicted, strict=True)
+        ]
+        return self._with_records(records, [self.size])
+
+    def correcting(
+        self, records: Sequence[RecordSensitivity], columns: Sequence[int]
+    ) -> "LinearProblem":
+        """The same problem, weights included, of records in which only these columns differ."""
+        return self._with_records(records, sorted(columns))
+
+    def _with_records(
+        self, records: Sequence[RecordSensitivity], changed: list[int]
+    ) -> "LinearProblem":
+        """Of records that differ in these columns alone; the residual is the last column."""
         out = copy.copy(self)
         out._reduced = {}
-        for kept in ("sizes", "apart"):
+        for kept in ("apart", "scales"):
             vars(out).pop(kept, None)
+        of_all = {*self.baseline, *self.own, *self.usual_own, self.size}
+        seen = set(changed)
+        out._fits = (
+            {} if seen & of_all else {k: f for k, f in self._fits.items() if not seen & {*k}}
+        )
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
-        records = []
-        for r, (record, values) in enumerate(zip(self.found.records, predicted, strict=True)):
-            moved = dc.replace(
-                record, predicted=values if record.bent is None else values + record.bent
-            )
-            records.append(moved)
-            b, of_force = self._products_of(record, moved, self.shape_values[r])
-            gram[r, -1], gram[r, :, -1] = b, b
-            force_gram[r, -1], force_gram[r, :, -1] = of_force, of_force
-        out.found = dc.replace(self.found, records=records)
+        for r, now in enumerate(records):
+            both = self._products_of(r, now, changed)
+            for G, products in zip((gram[r], force_gram[r]), both, strict=True):
+                G[:, changed], G[changed] = products, products.T
+        out.found = dc.replace(self.found, records=list(records))
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
 
@@ -308,7 +335,7 @@ class LinearProblem:
         kept = ([r for r in members if r != without] for members in self.conditions.values())
         return [reduced[np.array(members, int)].sum(0) for members in kept]
 
-    @functools.cached_property
+    @property
     def sizes(self) -> Sizes:
         """Of the discrepancy where no cause is at work."""
         return self.fitted_sizes()[0]
@@ -318,11 +345,14 @@ class LinearProblem:
     ) -> tuple[Sizes, float]:
         """Sizes of the discrepancy with columns of causes in the model, and the logarithm of the
         restricted likelihood with the prior."""
-        model = self.with_causes(causes)
-        grams = self.by_condition(model)
-        prior = model.prior[model.shared]
-        sizes, value = self.discrepancy.fit(grams, model.shared, prior, start)
-        return sizes, value - 0.5 * self.own_log_det(model)
+        key = tuple(causes)
+        if key not in self._fits:
+            model = self.with_causes(causes)
+            grams = self.by_condition(model)
+            prior = model.prior[model.shared]
+            sizes, value = self.discrepancy.fit(grams, model.shared, prior, start, TOLERANCE)
+            self._fits[key] = sizes, value - 0.5 * self.own_log_det(model)
+        return self._fits[key]
 
     def with_causes(self, causes: Sequence[int] = (), unusual: Sequence[int] = ()) -> Model:
         """The model with columns of causes, their coefficients normal with a standard deviation of

@@ -1,10 +1,10 @@
 """From evidence to a verdict: one for each cause, and how wrong the simulation is by itself."""
 
 import dataclasses as dc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from sliceit_drake.diagnosis.evidence.at_size import AtSize
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
@@ -181,6 +181,7 @@ def reach_verdict(
     progress: Callable[[int], None] | None = None,
     rule: DecisionRule | None = None,
     at_size: AtSize | None = None,
+    refuted: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Screens, names the cause with most evidence that may be named, and goes on beside it.
 
@@ -190,7 +191,10 @@ def reach_verdict(
         progress: Called with a number of replicates each time that these are done.
         rule: When a cause is named.
         at_size: What sees causes at the size that is found; without one by derivatives alone.
+        refuted: Causes that simulations do not bear out, by name, with the reason: they are not
+            named, and others are judged beside them.
     """
+    refuted = refuted or {}
     rule = rule or DecisionRule()
     counts = [len(m) for m in problem.conditions.values()]
     needed = rule.replicates - max(counts) if max(counts) < rule.replicates else 0
@@ -198,7 +202,8 @@ def reach_verdict(
     screenings: list[Screening] = []
     judged: list[Screening] = []
     refused: dict[str, str] = {}
-    # What would be named but for its bounds: others are judged beside it, and may not stand for it.
+    # What would be named but for its bounds, or for being refuted: others are judged beside it, and
+    # may not stand for it.
     aside: list[CauseEvidence] = []
     while True:
         assumed = [e.cause for e in (*(f.evidence for f in findings), *aside)]
@@ -214,7 +219,7 @@ def reach_verdict(
         # Beside what is only set aside nothing is excluded.
         if not aside:
             judged.append(screening)
-        beside_it = "".join(f", beside {o.name}, whose {_at_bound(o)}" for o in aside)
+        beside_it = "".join(f", beside {o.name}: {refused[o.name]}" for o in aside)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             if aside:
                 why = f"gains no more than chance gives{beside_it}"
@@ -222,11 +227,11 @@ def reach_verdict(
             break
         for e in sorted(screening.causes, key=lambda e: -e.gain):
             why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
-            if not why:
+            if not why and e.name not in refuted:
                 findings.append(Finding(e, e.size, e.share, _others(problem, screening, e)))
                 break
-            refused[e.name] = f"{why}{beside_it}"
-            if why == _at_bound(e):
+            refused[e.name] = f"{why or refuted[e.name]}{beside_it}"
+            if not why or why == _at_bound(e):
                 aside.append(e)
                 break
         else:
@@ -485,7 +490,7 @@ def _verdicts(
     rule: DecisionRule,
 ) -> list[CauseVerdict]:
     """One for each cause, those with most evidence first."""
-    wide = norm.ppf(1.0 - 0.5 * rule.limit)
+    wide = ndtri(1.0 - 0.5 * rule.limit)
     named = {f.evidence.name: f.evidence for f in findings}
     last = {e.name: e for s in screenings for e in s.causes} | named
     out = []

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.planned_slice import PlannedSlice
@@ -16,7 +16,7 @@ __all__ = ["MARGIN", "NEEDED", "NextExperiment", "Pair", "Step"]
 
 POWER = 0.9
 """Probability with which slices shall tell two causes apart."""
-NEEDED = float((norm.ppf(1.0 - DecisionRule.alarm) + norm.ppf(POWER)) ** 2)
+NEEDED = float((ndtri(1.0 - DecisionRule.alarm) + ndtri(POWER)) ** 2)
 """Expected gain that a test at the verdict's level finds with `POWER`."""
 MARGIN = 5.0
 """By which the angle shall exceed that of a class, degrees: sizes were estimated."""
