@@ -25,7 +25,7 @@ from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from studies.__main__ import main as studies
 from studies.learning import faster_draws
-from studies.learning.comparison import claim, compare, comparison_page, plot_boxes
+from studies.learning.comparison import EQUAL, claim, compare, comparison_page, plot_boxes
 from studies.learning.ratio import bootstrap_ratio
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -108,6 +108,7 @@ def rows(ours=6.0, baseline=10.0, world="stand_in", foods=("cucumber", "potato")
                             "food": food,
                             "slice": k,
                             "board_stiffness": 3e4,
+                            "seed": 0,
                             "median_force": level + 0.1 * k + 0.05 * seed,
                             "peak_force": 2.0 * level,
                             "board_peak": level,
@@ -153,6 +154,27 @@ def test_comparisons_are_in_the_order_of_worlds_and_boards():
     found = [(each.world, each.board_stiffness, each.food) for each in compare(both)]
     boards = (("curves", 3e4), ("stand_in", 3e4), ("stand_in", 3e5))
     assert found == [(*board, food) for board in boards for food in ("cucumber", "potato")]
+
+
+def test_a_baseline_with_all_else_equal_has_a_table_of_its_own_and_seeds_are_not_mixed():
+    equal = [
+        dict(row, policy=f"corrected_{row['policy']}")
+        for row in rows(baseline=7.5)
+        if row["simulator"] == "spring"
+    ]
+    other_seed = [dict(row, seed=1, median_force=1.0) for row in equal]
+    both = [*rows(), *equal, *other_seed]
+    ratio = {
+        kind: compare(both, "cutting", kind)[0].ratios["median_force"].value
+        for kind in ("spring", EQUAL)
+    }
+    assert ratio["spring"] == compare(rows())[0].ratios["median_force"].value
+    assert ratio["spring"] == pytest.approx(6.2 / 10.2)
+    assert ratio[EQUAL] == pytest.approx(6.2 / 7.7)
+    assert len(compare(both, "cutting", EQUAL)) == 2
+    page = comparison_page(compare(both), equal=compare(both, "cutting", EQUAL))
+    assert "| stand_in | cucumber | 12 of 12, 12 of 12 | **0.81**" in page
+    assert "all else equal" not in comparison_page(compare(both))
 
 
 def test_policies_that_did_not_cut_the_same_slices_are_not_compared():

@@ -46,6 +46,8 @@ TITLES = ("median force", "peak force", "peak force on the board", "duration")
 PAPER = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
 """Ratios of the contact force in the SliceIt! paper's figure: dual simulation over spring only."""
 OURS, BASELINE = "cutting", "spring"
+EQUAL = "corrected_spring"
+"""First words of the names of policies of the spring that have all else as our corrections."""
 COLOURS = {OURS: "#1b7a5a", BASELINE: "#b5532a"}
 NAMES = {OURS: "cutting simulator", BASELINE: "spring only"}
 WHOSE = {
@@ -82,6 +84,7 @@ def run(options: argparse.Namespace) -> int:
         texts = [file.read_text(encoding="utf-8") for file in options.evaluations]
         rows = [json.loads(line) for text in texts for line in text.splitlines()]
         found = compare(rows, options.ours)
+        equal = compare(rows, options.ours, EQUAL)
     except (OSError, ValueError, KeyError) as error:
         raise ConfigurationError(
             f"cannot be compared ({error})",
@@ -98,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
     figures.mkdir(parents=True, exist_ok=True)
     stem, _ = WHOSE[options.ours]
     page = options.output / f"{stem}_results.md"
-    publish(comparison_page(found, options.ours), page, [_facts(each) for each in found])
+    publish(comparison_page(found, options.ours, equal), page, [_facts(each) for each in found])
     boards = sorted({each.board_stiffness for each in found})
     usual = boards[len(boards) // 2]
     plot_boxes(
@@ -132,27 +135,31 @@ class Comparison:
     strict: Ratio
 
 
-def compare(rows: Sequence[Mapping], ours: str = OURS) -> list[Comparison]:
+def compare(
+    rows: Sequence[Mapping], ours: str = OURS, baseline: str = BASELINE
+) -> list[Comparison]:
     """Compares what `sliceit evaluate` wrote, where both kinds of policies cut the same slices.
 
     The comparisons are in the order of worlds, boards and foods, those of the paper first.
 
     Args:
         rows: Its lines.
-        ours: First word of the names of our policies; others of the cutting simulator are left out.
+        ours, baseline: First words of the names of our policies, and of those of the spring; others
+            of each simulator are left out.
 
     Raises:
         ValueError: A policy did not cut all slices that others did.
     """
     groups: dict[tuple, dict] = {}
     for row in rows:
-        if row["simulator"] == OURS and not Path(row["policy"]).name.startswith(ours):
+        meant = ours if row["simulator"] == OURS else baseline
+        if not Path(row["policy"]).name.startswith(meant):
             continue
-        key = (row["world"], row["food"], row["board_stiffness"])
+        key = (row["world"], row["food"], row["board_stiffness"], row["seed"])
         group = groups.setdefault(key, collections.defaultdict(dict))
         group[row["simulator"], row["policy"]][row["slice"]] = row
     found = []
-    for (world, food, board), policies in groups.items():
+    for (world, food, board, _), policies in groups.items():
         if {kind for kind, _ in policies} != {OURS, BASELINE}:
             continue
         slices = sorted({k for cut in policies.values() for k in cut})
@@ -241,9 +248,11 @@ def _two_slices(policies: Sequence[str]) -> dict[str, list[SliceTrace]]:
     }
 
 
-def comparison_page(found: Sequence[Comparison], whose: str = OURS) -> str:
+def comparison_page(
+    found: Sequence[Comparison], whose: str = OURS, equal: Sequence[Comparison] = ()
+) -> str:
     """The page; the paper's ratio stands beside the foods that it cut; `whose` as `ours` of
-    `compare`."""
+    `compare`; `equal` with a baseline that differs in its simulator alone."""
     rows = []
     for each in found:
         ours, baseline = each.values[OURS], each.values[BASELINE]
@@ -263,7 +272,17 @@ def comparison_page(found: Sequence[Comparison], whose: str = OURS) -> str:
         rows.append([*cells, interval(each.strict), paper])
     stem, what = WHOSE[whose]
     return render(
-        "slicing_results", claim=claim(found), titles=TITLES, rows=rows, stem=stem, what=what
+        "slicing_results",
+        claim=claim(found),
+        titles=TITLES,
+        rows=rows,
+        stem=stem,
+        what=what,
+        equal=[
+            [e.world, e.food, f"{share(e.completed[OURS])}, {share(e.completed[BASELINE])}"]
+            + [interval(e.ratios[metric]) for metric in METRICS]
+            for e in equal
+        ],
     )
 
 

@@ -54,7 +54,8 @@ def _whole_pages(docs: Path) -> Iterator[tuple[str, str]]:
         lines = (results / f"{stem}_evaluation.jsonl").read_text(encoding="utf-8").splitlines()
         rows += map(json.loads, lines)
         found = comparison.compare(rows, ours)
-        yield f"results/{stem}_results.md", comparison.comparison_page(found, ours)
+        equal = comparison.compare(rows, ours, comparison.EQUAL)
+        yield f"results/{stem}_results.md", comparison.comparison_page(found, ours, equal)
     replicates = results / "coverage.jsonl"
     count = len(replicates.read_text(encoding="utf-8").splitlines())
     problem = coverage.Problem()
