@@ -134,9 +134,9 @@ TESTED = {
         "sliceit train --output policy",
         "sliceit train --output output/ours --seed 0",
         "sliceit train --output output/baseline --seed 0 --simulator spring",
-        "sliceit train --output output/corrected --steps 12000"
-        ' --set "{updates: 2, task: {agent: {draw_increment: 7.5e-3,'
-        ' press_increment: 6.0e-3, rule: {level: 30.0, correction: 0.5}}}}"',
+        "sliceit train models/policies/correction.yaml --output output/corrected --seed 0",
+        "sliceit train models/policies/correction.yaml --output output/corrected_spring_0 --seed 0"
+        " --simulator spring",
         "sliceit train --output output/draws/cutting_0 --seed 0 --steps 15000"
         ' --set "{task: {agent: {draw_increment: 7.5e-3}}}"',
         "sliceit train --output output/draws/spring_0 --seed 0 --steps 15000 --simulator spring"
@@ -153,9 +153,14 @@ TESTED = {
         " --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/{cutting,spring}_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/results/slicing_evaluation.jsonl",
-        "sliceit evaluate models/policies/corrected_[0-4]"
-        " --output docs/results/corrected_evaluation.jsonl",
+        "sliceit evaluate models/policies/{corrected,spring}_[0-4] output/corrected_spring_[0-4]"
+        " --seed 11 --output docs/results/corrected_evaluation.jsonl",
         "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e3 3e5"
+        " --output docs/results/corrected_evaluation.jsonl",
+    ],
+    "tests/test_foreign_law.py::test_policies_are_evaluated_by_it_and_finish": [
+        "python -m studies foreign_law models/policies/{corrected,spring}_[0-4]"
+        " output/corrected_spring_[0-4] --seed 11"
         " --output docs/results/corrected_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [

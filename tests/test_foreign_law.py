@@ -1,5 +1,7 @@
 """A food by a law of the benches is cut in a station as the law says, from its context alone."""
 
+import json
+
 import numpy as np
 import pytest
 from pydrake.common.value import Value
@@ -7,7 +9,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 
+from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Specimen
+from studies.__main__ import main as studies
 from studies.benches.section import Section
 from studies.benches.slice_push import SlicePush
 from studies.learning.foreign_law import ForeignCutter, ForeignFood, ForeignWorld
@@ -86,3 +90,13 @@ def test_slices_of_a_food_have_its_law_and_differ_and_repeat():
     assert len({(food.toughness, food.diameter) for food in foods}) == 3
     assert ForeignWorld(5).scenario("potato", 1).cutting == foods[1]
     assert ForeignWorld(6).scenario("potato", 1).cutting.law != foods[1].law
+
+
+@pytest.mark.second_tier
+def test_policies_are_evaluated_by_it_and_finish(tmp_path, capsys):
+    policy, file = str(resource_path("models/policies/corrected_0")), tmp_path / "slices.jsonl"
+    assert studies(["foreign_law", policy, "--slices", "1", "--output", str(file)]) == 0
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    assert len(rows) == 4
+    assert all(r["world"] == "slice_push" and r["completed"] and r["peak_force"] > 2 for r in rows)
+    assert "slice_push" in capsys.readouterr().out
