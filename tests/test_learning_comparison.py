@@ -20,6 +20,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning import unseen_worlds
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice, slice_metrics
 from sliceit_drake.learning.task import Limits
+from sliceit_drake.learning.training_config import load_training
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -246,6 +247,13 @@ def test_the_page_says_what_the_policies_are_worth():
     said = " ".join((ROOT / "docs/explanation/learning.md").read_text().split())
     assert f"press with {min(ratios):.2f} to {max(ratios):.2f} times the contact force" in said
     assert f"it is {min(everywhere):.2f} to {max(everywhere):.2f} times" in said
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_shipped_correction_was_trained_as_its_file_says(seed):
+    said = load_training(ROOT / "models/policies/correction.yaml")
+    found = load_training(ROOT / f"models/policies/corrected_{seed}/training.yaml")
+    assert dc.replace(said, seed=seed) == found
 
 
 def test_a_trained_policy_runs_in_a_scenario():

@@ -1,7 +1,7 @@
-"""A trained policy beside a motion that was optimised without learning.
+"""Trained policies beside motions that were optimised without learning.
 
 For each food a press and draw is optimised on the calibrated model (`sliceit optimize-motion`), in
-as much time as the policy took, and cut by a stiff position controller; the policy decides by what
+as much time as a policy took, and cut by a stiff position controller; the policy decides by what
 it feels. Both cut the same slices of the stand-in world, whose foods differ from the calibrated
 ones. Metrics are those of `sliceit evaluate`.
 """
@@ -9,6 +9,7 @@ ones. Metrics are those of `sliceit evaluate`.
 import argparse
 import copy
 import dataclasses as dc
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,9 @@ def row(kind: str, found: list[SliceMetrics]) -> list[str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument("policy", type=Path, help="folder of a training")
+    parser.add_argument(
+        "policies", nargs="+", metavar="POLICY", type=Path, help="folder of a training"
+    )
     parser.add_argument(
         "--foods", nargs="+", choices=SLICING_FOODS, default=list(SLICING_FOODS), help="all"
     )
@@ -97,21 +100,26 @@ def run(options: argparse.Namespace) -> int:
     PLACE.check(options.output)
     from sliceit_drake.learning.training_config import POLICY, load_policy_folder
 
-    config = load_policy_folder(options.policy)
-    agent = dc.replace(config.task.agent, network=str(options.policy / POLICY))
-    decide, stiff = load_network(agent), load_scenario(resource_path(STIFF)).controller
+    stiff = load_scenario(resource_path(STIFF)).controller
+    agents = {}
+    for policy in options.policies:
+        agent = load_policy_folder(policy).task.agent
+        agents[policy.name] = dc.replace(agent, network=str(policy / POLICY))
     rows = []
-    for food in tqdm(options.foods, desc="foods"):
-        scenarios = [StandInWorld().scenario(food, k)[0] for k in range(options.slices)]
-        agents = [cut_slice(copy.deepcopy(each), agent, decide).metrics for each in scenarios]
-        # Without what it takes to come to the food and to wait for the goal.
-        duration = float(np.median([each.duration for each in agents])) - 0.7
-        motion = optimum(food, max(duration, 1.0))
-        planned = [cut_by_motion(each, motion, stiff) for each in scenarios]
-        what = (
-            f"motion: {1e3 * motion.press_speed:.0f} mm/s down, {1e3 * motion.amplitude:.0f} mm at "
-            f"{motion.frequency:.1f} Hz"
-        )
-        rows += [[food, *row("policy", agents)], ["", *row(what, planned)]]
+    with tqdm(total=len(options.foods) * len(agents), desc="motions") as bar:
+        for food, (name, agent) in itertools.product(options.foods, agents.items()):
+            scenarios = [StandInWorld().scenario(food, k)[0] for k in range(options.slices)]
+            decide = load_network(agent)
+            cut = [cut_slice(copy.deepcopy(each), agent, decide).metrics for each in scenarios]
+            # Without what it takes to come to the food and to wait for the goal.
+            duration = float(np.median([each.duration for each in cut])) - 0.7
+            motion = optimum(food, max(duration, 1.0))
+            planned = [cut_by_motion(each, motion, stiff) for each in scenarios]
+            what = (
+                f"motion: {1e3 * motion.press_speed:.0f} mm/s down, {1e3 * motion.amplitude:.0f} mm"
+                f" at {motion.frequency:.1f} Hz"
+            )
+            rows += [[food, *row(name, cut)], ["", *row(what, planned)]]
+            bar.update()
     PLACE.publish(options.output, rows=rows, command=options.command, slices=options.slices)
     return 0
