@@ -140,7 +140,9 @@ def _corrected(
         )
         for before, after in zip(last.found.records, moved.found.records, strict=True)
     ]
-    return moved.correcting(records, columns)
+    # Made anew: where a force jumps is where the simulation now has it.
+    found = dc.replace(moved.found, records=records)
+    return LinearProblem(found, moved.noise, moved.variation)
 
 
 def _fit(problem: LinearProblem, columns: list[int], causes: list[int]) -> tuple[np.ndarray, float]:
