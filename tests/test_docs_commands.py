@@ -318,7 +318,7 @@ READ_ONLY = {
         python -m studies foods_page --cut --output docs/reference/foods.md
         python -m studies foods_page --hold --output docs/reference/foods.md
         python -m studies learning_speed --output docs/results/learning.md --json docs/results/benchmarks/learning_speed.json
-        python -m studies policy_and_motion models/policies/cutting_0 --output docs/results/learning.md
+        python -m studies policy_and_motion models/policies/cutting_0 models/policies/corrected_0 --output docs/results/learning.md
         python -m studies safety_layer
         python -m studies scaling --output docs/results/scaling.md
         python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/results/scaling.md

@@ -271,9 +271,16 @@ def comparison_page(
         paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
         rows.append([*cells, interval(each.strict), paper])
     stem, what = WHOSE[whose]
+    said = claim(found)
+    if equal:
+        less = [f"{e.food} ({e.world})" for e in equal if e.ratios["median_force"].high < 1.0]
+        said.append(
+            "- **All else equal** (last table): less contact force "
+            f"{_listed(less, 'on ', 'is shown on no food in any world')}."
+        )
     return render(
         "slicing_results",
-        claim=claim(found),
+        claim=said,
         titles=TITLES,
         rows=rows,
         stem=stem,
@@ -304,7 +311,7 @@ def plot_boxes(found: Sequence[Comparison], file: Path) -> None:
         file: .png.
     """
     worlds = list(dict.fromkeys(each.world for each in found))
-    figure = new_figure(9.0, 3.6)
+    figure = new_figure(max(9.0, 3.9 * len(worlds)), 3.6)
     axes = figure.subplots(1, len(worlds), sharey=True, squeeze=False)[0]
     for axis, world in zip(axes, worlds, strict=True):
         here = [each for each in found if each.world == world]
