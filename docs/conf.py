@@ -19,6 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+
+# Before torch is mocked, which it asks about while it loads.
+import scipy.stats  # noqa: F401
 from myst_parser.parsers.sphinx_ import MystParser
 from sphinx.application import Sphinx
 from sphinx.ext.autodoc.mock import mock
