@@ -178,6 +178,12 @@ def test_a_baseline_with_all_else_equal_has_a_table_of_its_own_and_seeds_are_not
     assert "all else equal" not in comparison_page(compare(both))
 
 
+def test_policies_of_any_name_are_compared_by_their_simulator():
+    renamed = [dict(row, policy=f"output/mine_{row['policy'][::-1]}") for row in rows()]
+    assert len(compare(renamed)) == len(compare(rows())) == 2
+    assert compare(renamed, "corrected") == []
+
+
 def test_policies_that_did_not_cut_the_same_slices_are_not_compared():
     with pytest.raises(ValueError, match=r"spring_2 did not cut slices \[3\] of potato"):
         compare(rows()[:-1])

@@ -12,12 +12,18 @@ Writes a line for each slice to --output, a .jsonl file, and goes on where it is
 
 import argparse
 import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import SEEDS, WORKERS, check_numbers, output_path
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.resources import here_or_shipped
 
-__all__ = ["add_arguments", "run"]
+if TYPE_CHECKING:
+    from sliceit_drake.learning.unseen_worlds import Case
+
+__all__ = ["add_arguments", "cut_and_print", "run"]
 
 WORLDS = ("stand_in", "curves")
 FOODS = ("cucumber", "tomato", "potato", "carrot")
@@ -59,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     check_numbers(options, slices=(1, math.inf), seed=SEEDS, workers=WORKERS)
     check_numbers(options, board_stiffness=(1e2, 1e8))
-    from sliceit_drake.learning.unseen_worlds import cases_of, evaluate, results_table
+    from sliceit_drake.learning.unseen_worlds import cases_of
 
     cases = cases_of(
         options.policies,
@@ -69,12 +75,21 @@ def run(options: argparse.Namespace) -> int:
         options.seed,
         options.slices,
     )
+    cut_and_print(cases, options.output, options.workers)
+    return 0
+
+
+def cut_and_print(
+    cases: "Sequence[Case]",
+    output: Path,
+    workers: int,
+    cut_case: "Callable[[Case], dict] | None" = None,
+) -> None:
+    """Cuts slices with a bar, and prints their table; see `unseen_worlds.evaluate`."""
+    from sliceit_drake.learning.unseen_worlds import evaluate, results_table
+
     with StageBars() as bars:
         evaluate(
-            cases,
-            options.output,
-            options.workers,
-            lambda done: bars.show("slices", done, len(cases)),
+            cases, output, workers, lambda done: bars.show("slices", done, len(cases)), cut_case
         )
-    print(results_table(options.output, cases))
-    return 0
+    print(results_table(output, cases))

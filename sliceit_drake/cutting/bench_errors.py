@@ -72,7 +72,7 @@ class SensorErrors:
 def _filtered(share: float, values: np.ndarray, state: np.ndarray) -> np.ndarray:
     """Each value and what is left of those before it [N, ...], from a state of the filter [1, ...];
     see `scipy.signal.lfilter`."""
-    # Takes a second to load, and a bench without errors needs none.
+    # Slow to load, and needed only here.
     from scipy.signal import lfilter
 
     return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=0, zi=state)[0])

@@ -292,7 +292,7 @@ def _filtered(
     time: np.ndarray, values: np.ndarray, cutoff: float, order: int, zero_phase: bool
 ) -> np.ndarray:
     """A Butterworth filter along the rows, which starts as if the first value had always been."""
-    # Takes a second to load, and most records are not filtered.
+    # Slow to load, and needed only here.
     from scipy.signal import butter, sosfilt, sosfilt_zi, sosfiltfilt
 
     period = float(np.median(np.diff(time)))

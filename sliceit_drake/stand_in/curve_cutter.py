@@ -24,7 +24,7 @@ from sliceit_drake.stand_in.curve_laws import (
 )
 from sliceit_drake.systems.knife_force import CuttingSetup, KnifeForceSystem
 
-__all__ = ["CurveCutter", "CurveFood", "food_curve"]
+__all__ = ["CurveCutter", "CurveFood", "edge_over_middle", "food_curve"]
 
 BORROWED = {"carrot": ("potato", 0.5 * (47.9 + 67.6))}
 """Foods without a curve: whose shape they take, and the largest force, N."""
@@ -50,6 +50,20 @@ def food_curve(name: str) -> FoodCurve:
     other, largest = BORROWED[name]
     curve = measured_curve(other)
     return curve.scaled(largest / float(curve.force.max()))
+
+
+def edge_over_middle(p_FK: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the edge is over the middle of the food, in F, metres.
+
+    Args:
+        p_FK: Place of Ko [3].
+        along: Direction of the edge [3].
+
+    Returns:
+        Place of Ko, with the height of that point [3]; from Ko to that point [3].
+    """
+    arm = -p_FK[0] / along[0] * along
+    return p_FK + [0.0, 0.0, arm[2]], arm
 
 
 @dc.dataclass
@@ -170,5 +184,5 @@ class CurveCutter(KnifeForceSystem):
         """
         p_FK = self._R_WF.T @ (X_WK.translation() - self._p_WF)
         along = self._R_WF.T @ X_WK.rotation().matrix()[:, 0]
-        arm = -p_FK[0] / along[0] * along
-        return p_FK + [0.0, 0.0, arm[2]], along, arm
+        place, arm = edge_over_middle(p_FK, along)
+        return place, along, arm

@@ -46,13 +46,13 @@ TITLES = ("median force", "peak force", "peak force on the board", "duration")
 PAPER = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
 """Ratios of the contact force in the SliceIt! paper's figure: dual simulation over spring only."""
 OURS, BASELINE = "cutting", "spring"
-EQUAL = "corrected_spring"
-"""First words of the names of policies of the spring that have all else as our corrections."""
+CORRECTED, EQUAL = "corrected", "corrected_spring"
+"""Kinds of policies: ours that correct a rule, and those of the spring that have all else equal."""
 COLOURS = {OURS: "#1b7a5a", BASELINE: "#b5532a"}
 NAMES = {OURS: "cutting simulator", BASELINE: "spring only"}
 WHOSE = {
     "cutting": ("slicing", "policies that were trained in the cutting simulator"),
-    "corrected": (
+    CORRECTED: (
         "corrected",
         "policies that correct a rule with draws of up to 150 mm/s "
         "([learning.md](../explanation/learning.md#a-rule-and-what-corrects-it))",
@@ -144,16 +144,14 @@ def compare(
 
     Args:
         rows: Its lines.
-        ours, baseline: First words of the names of our policies, and of those of the spring; others
-            of each simulator are left out.
+        ours, baseline: Kinds of policies, see `_kind`; others are left out.
 
     Raises:
         ValueError: A policy did not cut all slices that others did.
     """
     groups: dict[tuple, dict] = {}
     for row in rows:
-        meant = ours if row["simulator"] == OURS else baseline
-        if not Path(row["policy"]).name.startswith(meant):
+        if _kind(row) not in (ours, baseline):
             continue
         key = (row["world"], row["food"], row["board_stiffness"], row["seed"])
         group = groups.setdefault(key, collections.defaultdict(dict))
@@ -193,6 +191,13 @@ def compare(
         found.append(Comparison(world, food, board, values, completed, ratios, strict))
     order = [*PAPER, *sorted({each.food for each in found} - set(PAPER))]
     return sorted(found, key=lambda e: (e.world, e.board_stiffness, order.index(e.food)))
+
+
+def _kind(row: Mapping) -> str:
+    """The simulator of a policy; of one whose name says that it corrects a rule, as in `WHOSE`."""
+    if not Path(row["policy"]).name.startswith(CORRECTED):
+        return str(row["simulator"])
+    return CORRECTED if row["simulator"] == OURS else EQUAL
 
 
 def claim(found: Sequence[Comparison]) -> list[str]:

@@ -17,10 +17,11 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, State
 
-from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.cli.evaluate import cut_and_print
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.learning.unseen_worlds import Case, cases_of, cut, evaluate, results_table
+from sliceit_drake.learning.unseen_worlds import Case, cases_of, cut
+from sliceit_drake.stand_in.curve_cutter import edge_over_middle
 from sliceit_drake.stand_in.protocol import Condition, Specimen
 from sliceit_drake.stand_in.slicing_worlds import SLICING_FOODS, SlicingWorld, slice_size
 from sliceit_drake.systems.knife_force import CuttingSetup, KnifeForceSystem
@@ -118,8 +119,9 @@ class ForeignCutter(KnifeForceSystem):
     def _edge(self, X_WK: RigidTransform) -> tuple[float, float, float]:
         """Where Ko is along the edge, and where the edge is over the middle of the food, in F."""
         X_FK = self._X_FW @ X_WK
-        p_FK, along = X_FK.translation(), X_FK.rotation().matrix()[:, 0]
-        return float(p_FK[0]), float(p_FK[1]), float(p_FK[2] - p_FK[0] / along[0] * along[2])
+        place, _ = edge_over_middle(X_FK.translation(), X_FK.rotation().matrix()[:, 0])
+        x, y, z = place.tolist()
+        return x, y, z
 
 
 @dc.dataclass
@@ -155,13 +157,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     cases = cases_of(options.policies, [WORLD], SLICING_FOODS, [3e4], options.seed, options.slices)
-    with StageBars() as bars:
-        evaluate(
-            cases,
-            options.output,
-            options.workers,
-            lambda done: bars.show("slices", done, len(cases)),
-            _cut_case,
-        )
-    print(results_table(options.output, cases))
+    cut_and_print(cases, options.output, options.workers, _cut_case)
     return 0
