@@ -194,8 +194,9 @@ def test_a_command_that_goes_on_says_so_when_it_is_interrupted(tmp_path, monkeyp
 
 def leave_a_note(folder: Path) -> None:
     """For a process: works until it is ended."""
-    (folder / "began").touch()
     try:
+        # Within, since what waits for this file ends the process at once.
+        (folder / "began").touch()
         time.sleep(600.0)
     finally:
         (folder / "cleaned").touch()
