@@ -20,6 +20,7 @@ from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import LAW
+from sliceit_drake.diagnosis.known_error import learn_known_error
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.records.slice_record import SliceRecord
@@ -135,6 +136,30 @@ def test_what_a_file_is_said_to_be_worth_it_is_worth_on_other_slices(
     )
     assert after == pytest.approx(said_after, rel=0.1)
     assert before - after == pytest.approx(said_before - said_after, rel=0.1)
+
+
+def test_what_was_so_at_the_calibration_is_not_named_again(cache, tmp_path):
+    """A skin that the model has not stands for a law that is wrong; then the sensor drifts."""
+    given = CalibratedFood(food=PROTOCOL.food, knife=PROTOCOL.knife)
+    setup = setup_of_food(given, REFINEMENT)
+    before, after = cut(61, "skin:2.0"), cut(62, "skin:2.0", "sensor_drift:0.6")
+    given.known_error = learn_known_error(setup, before, cache, workers=1)
+    dump_yaml(given, tmp_path / "food.yaml")
+    known = load_calibrated_food(tmp_path / "food.yaml").known_error
+    settings = {"cache": cache, "replicates": REPLICATES, "workers": 1}
+    # Unless that is known, the law is as wrong as four times the noise beside the sensor.
+    plain, found = (diagnose(setup, after, **settings, known=k) for k in (None, known))
+    assert plain.verdict.misfit > 3.0
+    assert found.verdict.names == [["sensor_zero"]] and found.verdict.misfit < 0.6
+    assert "skin" not in {e.name for s in found.verdict.screenings for e in s.causes if e.score > 0}
+    # Where nothing has changed nothing is named, though a skin would be without the file.
+    same = cut(63, "skin:2.0")
+    plain, found = (diagnose(setup, same, **settings, known=k) for k in (None, known))
+    assert "skin" in plain.verdict.names[0] and not found.verdict.names
+    # Of the records that it was learnt from it can say nothing.
+    again = diagnose(setup, before, **settings, known=known)
+    assert again.verdict.names and again.problem.found.known_from == 0
+    assert any("cannot tell what has changed" in remark for remark in again.remarks)
 
 
 def test_spikes_and_missing_rows_change_no_verdict(cache):

@@ -5,7 +5,9 @@ that is left out, says why it takes or leaves each, polishes what it took with G
 says how sure it is. With --structure setup it keeps the setup's, searches with Optuna's TPE and
 refines the best places with Adam on the exact gradient. Without --food the record says name, shape
 and size. Writes to DIR:
-  food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`
+  food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`; from
+                    two records on with what the simulation gets wrong in them, for a diagnosis of
+                    later ones
   calibration.json  errors by stage, held-out errors, parameters
   first_fit.png     a fit on a coarse mesh, after a few seconds: do record and setup go together?
   fit.png           measured and predicted force
@@ -48,6 +50,8 @@ __all__ = ["add_arguments", "run"]
 
 TRIALS = 500
 """Of a search."""
+REFINEMENT = 0.75
+"""Of the mesh on which changes of the force are computed, as `sliceit diagnose` does."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -249,6 +253,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     print("\n".join([result.table(), *(f"Warning: {text}" for text in warnings)]))
     if options.per_point:
         _fit_points(options, result)
+    if len(fitted) > 1:
+        _learn_known_error(fitted, options)
     print(f"Results in {options.output}/")
     return 0
 
@@ -271,6 +277,30 @@ def _first_fit(
     options.output.mkdir(parents=True, exist_ok=True)
     found.save(options.output / "first_fit.png")
     print(f"First fit, on a coarse mesh: {found.rms:.3f} N, {options.output}/first_fit.png")
+
+
+def _learn_known_error(records: "Sequence[SliceRecord]", options: argparse.Namespace) -> None:
+    """Adds to food.yaml what the simulation gets wrong by itself in the records."""
+    from sliceit_drake.configuration import dump_yaml
+    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+    from sliceit_drake.cutting.solver import CuttingError
+    from sliceit_drake.diagnosis.diagnose import setup_of_food
+    from sliceit_drake.diagnosis.known_error import learn_known_error
+
+    file = options.output / "food.yaml"
+    food = load_calibrated_food(file)
+    try:
+        with StageBars() as bars:
+            food.known_error = learn_known_error(
+                setup_of_food(food, REFINEMENT),
+                records,
+                workers=options.workers,
+                progress=lambda done, all: bars.show("what it gets wrong", done, all),
+            )
+    except (ConfigurationError, CuttingError) as error:
+        print(f"What the simulation gets wrong is not in food.yaml: {error}")
+        return
+    dump_yaml(food, file)
 
 
 def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:

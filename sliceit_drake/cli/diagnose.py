@@ -143,7 +143,9 @@ def _diagnose(
     from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
 
     setup = setup_of_food(food, options.refinement)
-    result = diagnose(setup, records, **settings, other_food=options.other_food)
+    result = diagnose(
+        setup, records, **settings, other_food=options.other_food, known=food.known_error
+    )
     if options.next_experiment is not None:
         show = functools.partial(settings["progress"], "motions of the menu")
         result.next_experiment = next_experiment(

@@ -9,14 +9,16 @@ from threadpoolctl import threadpool_limits
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.known_error import KnownError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.at_size import AtSize
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
+from sliceit_drake.diagnosis.known_error import record_key, with_known_error
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
@@ -61,6 +63,7 @@ def diagnose(
     workers: Workers = None,
     progress: Progress | None = None,
     other_food: bool = False,
+    known: KnownError | None = None,
 ) -> Diagnosis:
     """Shows what the simulation gets wrong in records, names the cause and measures the gain.
 
@@ -73,6 +76,8 @@ def diagnose(
         workers: What simulates.
         progress: See `Progress`.
         other_food: Whether records of a food of another name than the model's are meant.
+        known: What the food's file says that the simulation gets wrong; not used with the records
+            that it was learnt from.
 
     Raises:
         ConfigurationError: The records do not carry a diagnosis, with what would be needed.
@@ -104,9 +109,14 @@ def diagnose(
         progress=lambda done, total: show("simulations", done, total),
     )
     remarks += found.warnings
+    if known is not None:
+        found, why = _with_known(found, known, records)
+        remarks += why
     predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
     problem = at_own_values(
-        LinearProblem(found), predictor, lambda done, total: show("own values", done, total)
+        LinearProblem(found, may_be_uneven=found.known_from > 0),
+        predictor,
+        lambda done, total: show("own values", done, total),
     )
     if not problem.repeated:
         remarks.append(
@@ -142,6 +152,19 @@ def diagnose(
         if not (found_wrong := result.refuted()):
             return result
         refuted |= found_wrong
+
+
+def _with_known(
+    found: Sensitivities, known: KnownError, records: Sequence[SliceRecord]
+) -> tuple[Sensitivities, list[str]]:
+    """Sensitivities with what the food's file knows, or as they were with the reason."""
+    if {*map(record_key, records)} & {*known.records}:
+        why = "it was learnt from records that are among these, which cannot tell what has changed"
+    elif (more := with_known_error(found, known)) is not None:
+        return more, []
+    else:
+        why = "some of these cuts are of another speed or draw than those that it was learnt from"
+    return found, [f"What the food's file says that the simulation gets wrong is not used: {why}."]
 
 
 def _shifts(

@@ -33,6 +33,8 @@ from tqdm import tqdm
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagnosis.diagnose import setup_of_food
+from sliceit_drake.diagnosis.known_error import learn_known_error
 from sliceit_drake.records.slice_record import write_record
 from studies.benches.calibrated import calibrated, food_records, misfit_of
 from studies.benches.draw import LAWS, PARTS, RESERVED, Draw, seed_of
@@ -169,8 +171,11 @@ class _Bench:
         self.folder = output / "draws" / f"{law}_{number:02d}"
         self.misfit, self.model = misfit_of(self.draw)
         self.sizes = Sizes(self.draw, self.misfit)
-        earlier = food_records(self.draw.records(seed=EARLIER))
-        self.food = calibrated(self.model, earlier)
+        earlier = self.draw.records(seed=EARLIER)
+        self.food = calibrated(self.model, food_records(earlier))
+        # As `sliceit calibrate` leaves it.
+        setup = setup_of_food(self.food, DIAGNOSIS_REFINEMENT)
+        self.food.known_error = learn_known_error(setup, earlier, output / "cache", workers=1)
         write_json(
             self.folder.with_suffix(".json"),
             {"law": law, "draw": number, "seed": seed, "misfit": self.misfit}
@@ -210,6 +215,8 @@ class _Bench:
                 food = self.food
                 if to == "affected":
                     food = calibrated(food, food_records(records))
+                    # What is learnt from records is not used with them.
+                    food.known_error = None
                 begin = time.monotonic()
                 cache = self.output / "cache"
                 cache.mkdir(parents=True, exist_ok=True)

@@ -240,7 +240,7 @@ class ProtocolSizes:
             except CuttingError:
                 out.append(float("nan"))
                 continue
-            problem = LinearProblem(_with_column(found, changes), null.noise, null.variation)
+            problem = LinearProblem(_with_column(found, changes), *null.slice_levels)
             column = len(found.columns)
             out.append(effect_in_noise(problem, [column], np.ones(1))[0])
         return out
@@ -297,7 +297,8 @@ class ProtocolSizes:
         list can do, what is free in any case taken off both: a cause that is near can mimic it."""
         found, null = self._full
         problem = LinearProblem(
-            _with_column(found, self._change(effect, size)), null.noise, null.variation
+            _with_column(found, self._change(effect, size)),
+            *null.slice_levels,
         )
         screening = screen(problem, 2)
         hidden = dc.replace(screening.evidence("hidden"), coefficients=[1.0], scan=None)

@@ -9,6 +9,7 @@ from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 from sliceit_drake.cutting.foods.effects import Compliance
 from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.known_error import KnownError
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.resources import known_yaml
@@ -28,6 +29,7 @@ class CalibratedFood:
         distribution: Joint distribution of the parameters; randomisation draws from it.
         spring: The spring-only baseline from the same records, or null.
         bench: What the bench of the records does otherwise than is assumed.
+        known_error: What the simulation gets wrong by itself in the records, or null.
         records: Records that it was calibrated on, or the sources of a food without records.
         date, command: When and how it was calibrated.
         note: What it cannot be used for.
@@ -38,6 +40,7 @@ class CalibratedFood:
     distribution: ParameterDistribution = dc.field(default_factory=ParameterDistribution)
     spring: SpringFood | None = None
     bench: BenchErrors = dc.field(default_factory=BenchErrors)
+    known_error: KnownError | None = None
     rms_error: float | None = quantity(None, "N", low=0.0, high=1e6)
     """On the records."""
     held_out_error: float | None = quantity(None, "N", low=0.0, high=1e6)

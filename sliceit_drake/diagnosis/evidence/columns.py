@@ -74,6 +74,8 @@ class RecordSensitivity:
         doubt: Standard deviation by which each measurement is doubted [m, c]; None for none.
         bent: Part of the prediction that is beyond the first order of what is the record's own
             (`own_values`) [m, c]; None where that was not looked at.
+        known: Part of the prediction that no simulation has: what the food's file says that it gets
+            wrong [m, c]; None for nothing.
         height: Depth at which the board is, metres; infinite where none is in reach.
         slice_index: Order of the slice in its session.
     """
@@ -92,6 +94,7 @@ class RecordSensitivity:
     even: np.ndarray
     doubt: np.ndarray | None = None
     bent: np.ndarray | None = None
+    known: np.ndarray | None = None
     height: float = np.inf
     slice_index: int = 0
 
@@ -99,6 +102,12 @@ class RecordSensitivity:
     def residual(self) -> np.ndarray:
         """Measured less predicted [m, c]."""
         return self.measured - self.predicted
+
+    @property
+    def not_simulated(self) -> np.ndarray | float:
+        """Part of the prediction that a simulation of the mean slice does not have [m, c]."""
+        parts = [part for part in (self.bent, self.known) if part is not None]
+        return np.sum(parts, axis=0) if parts else 0.0
 
     @property
     def forces(self) -> list[int]:
@@ -151,12 +160,16 @@ class Sensitivities:
         records: One a record.
         warnings: Such as causes whose slices broke down: their column is 0 for that record.
         elements: Most tetrahedra of a slice's food.
+        known_from: Number of the slices that an error that is known was learnt from.
+        known_chance: Gains of causes there, where nothing had changed.
     """
 
     columns: list[Column]
     records: list[RecordSensitivity]
     warnings: list[str] = dc.field(default_factory=list)
     elements: int = 0
+    known_from: int = 0
+    known_chance: dict[str, float] = dc.field(default_factory=dict)
 
     def index(self, kind: str, name: str | None = None, scan: float | None = None) -> list[int]:
         """Numbers of the columns of a kind; of a name, of a value of the scan, if given."""

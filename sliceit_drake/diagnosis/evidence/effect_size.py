@@ -5,7 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, fit_shared, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import (
+    LinearProblem,
+    Model,
+    fit_shared,
+    integrate_out,
+    scaled_inverse,
+)
 from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
 
 __all__ = ["OwnError", "size_by_record", "standardised_size"]
@@ -165,13 +171,27 @@ def size_by_record(
     """
     own, base = list(columns), problem.base
     gram, effects = np.zeros((len(base) + 1, len(base) + 1)), []
-    records = zip(problem.found.records, problem.scales, coefficients, strict=True)
-    for record, scale, g in records:
+    of_slice = problem.uneven.reshape(len(problem.noise), -1)
+    records = zip(
+        problem.found.records,
+        problem.shape_values,
+        problem.levels[problem.condition_of],
+        problem.scales,
+        coefficients,
+        strict=True,
+    )
+    for record, shapes, level, scale, g in records:
+        uneven = (level[:, None] * of_slice) ** 2
         effect, error = record.columns[:, :, own] @ g, problem.model_error(record)
         effects.append((effect / scale).ravel())
         X = np.concatenate([record.columns[:, :, base], effect[:, :, None]], axis=2).astype(float)
         for c, noise in enumerate(problem.noise):
-            gram += X[:, c].T @ noise.solve(record.time, X[:, c], error[:, c], record.near)
+            all_of_it = np.column_stack([shapes, X[:, c]])
+            G = all_of_it.T @ noise.solve(record.time, all_of_it, error[:, c], record.near)
+            random = np.flatnonzero(uneven[c])
+            fitted = shapes.shape[1]
+            G = integrate_out(0.5 * (G + G.T), random.tolist(), uneven[c][random])
+            gram += G[fitted:, fitted:]
     product = gram[:-1, -1]
     square = gram[-1, -1] - product @ scaled_inverse(gram[:-1, :-1]) @ product
     rows = int(_acts(np.concatenate(effects)).sum())
@@ -186,7 +206,11 @@ def _scales(
     included where one is given, each [m, c]."""
     if wrong is None:
         return problem.scales
-    return [np.hypot(*both) for both in zip(wrong.scales(found), problem.scales, strict=True)]
+    scales = zip(problem.found.records, wrong.scales(found), strict=True)
+    return [
+        np.sqrt(own**2 + problem.noise_of(r) ** 2 + problem.model_error(r) ** 2)
+        for r, own in scales
+    ]
 
 
 def _acts(effect: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def held_out_share(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> flo
 
 
 def _noise(problem: LinearProblem) -> float:
-    return float(sum(problem.noise[k].deviation ** 2 for k in problem.forces))
+    return float(sum(problem.differences[k].deviation ** 2 for k in problem.forces))
 
 
 def _share(mean: np.ndarray, noise: float) -> float:
@@ -198,7 +198,10 @@ class _Linear:
     ) -> None:
         self.problem, self.sizes = problem, sizes
         self.model = problem.with_causes(problem.found.of_causes(causes), not_usual)
-        self.columns, self.own = self.model.shared, self.model.own
+        # How uneven it is nobody predicts.
+        d = int(np.sum(np.array(self.model.own) < len(problem.found.columns)))
+        self.columns, self.own = self.model.shared, self.model.own[:d]
+        self.variance = self.model.variance[:d]
 
     def shared(self, without: int | None = None) -> np.ndarray:
         """Coefficients of the shared columns from all records, or all but one."""
@@ -212,6 +215,6 @@ class _Linear:
     def of_own(self, r: int, theta: np.ndarray) -> np.ndarray:
         """Coefficients of what is a record's own, from itself."""
         G, own = self.problem.moments.gram[r], self.own
-        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.model.variance, 1e-12))
+        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.variance, 1e-12))
         rest = G[own, self.problem.size] - G[np.ix_(own, self.columns)] @ theta
         return np.asarray(np.linalg.solve(inner, rest))

@@ -30,6 +30,8 @@ from sliceit_drake.diagnosis.evidence.noise_levels import (
 )
 from sliceit_drake.diagnosis.evidence.searches import unlike_others
 from sliceit_drake.prediction.discrepancy import (
+    LESS,
+    PRIOR,
     USUAL_SHARE,
     Covariates,
     Discrepancy,
@@ -68,6 +70,12 @@ PLAUSIBLE = 2.0
 """Standard deviation of a cause's number before the data, in its size."""
 TOLERANCE = 0.1
 """Of the gradient of the log-likelihood where sizes count as found."""
+UNEVEN = ("in", "rest", "out", "again")
+"""Phases in which slices of a food are uneven: the first of `PHASES`."""
+LITTLE = 0.1
+"""Least share of the usual force of a channel that slices differ in."""
+BETTER = 20.0
+"""Twice the logarithm of the likelihood by which slices that are uneven have to be likelier."""
 KEPT = 4
 """Sets of reduced Gram matrices that are kept."""
 
@@ -111,6 +119,8 @@ class LinearProblem:
     Attributes:
         found: Sensitivities.
         noise: Of each channel.
+        differences: By which slices that are cut alike differ beside `own`, as if it were noise:
+            the same where the food is not `uneven`.
         repeated: Whether the noise is from replicates.
         conditions: Numbers of the records of each condition.
         condition_of: Number of the condition of each record [R].
@@ -126,6 +136,10 @@ class LinearProblem:
         moments: Of the records.
         forces: Numbers of the channels that are forces.
         variation: Standard deviations of `own` from slice to slice [len(own)], in their sizes.
+        uneven: Standard deviations of the coefficients of `shapes` from slice to slice, beside
+            `own`: how uneven the food is [len(shapes)]; times `levels`. Where an error of the
+            simulation is known from other slices, how these differed counts as well.
+        levels: By which slices of a condition differ more or less than others, by channel [C, c].
         variation_samples: Number of independent differences that they were estimated from.
     """
 
@@ -134,8 +148,11 @@ class LinearProblem:
         found: Sensitivities,
         noise: Sequence[ChannelNoise] | None = None,
         variation: np.ndarray | None = None,
+        uneven: np.ndarray | None = None,
+        differences: Sequence[ChannelNoise] | None = None,
+        may_be_uneven: bool = False,
     ) -> None:
-        self.found = found
+        self.found, self.may_be_uneven = found, may_be_uneven
         self.base = found.index("base")
         self.own = found.index("record")
         self.numerical = found.index("numerical")
@@ -144,18 +161,34 @@ class LinearProblem:
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]
         self.usual, self.usual_own = self._usual()
-        if noise is None:
-            zero = list(self.usual_own)
-            self.noise, self.repeated = estimate_noise(found.records, self.own, zero)
-        else:
-            self.noise, self.repeated = tuple(noise), True
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
         self._fits: dict[tuple[int, ...], tuple[Sizes, float]] = {}
-        self._make_moments()
+        self._make_shapes()
         # In the air slices do not differ.
         cut = [g for g in self.conditions.values() if found.records[g[0]].in_contact.any()]
-        self.variation_samples = sum(len(g) - 1 for g in cut)
-        self.variation = self._estimate_variation() if variation is None else variation
+        self._cut = [r for g in cut for r in g]
+        self.variation_samples = len(self._cut) - len(cut)
+        self._errors = [self.model_error(r) for r in found.records]
+        self.uneven = np.zeros(len(self.shapes)) if uneven is None else uneven
+        if noise is None:
+            self.noise, self.repeated = self._estimate_noise(found.records, False)
+        else:
+            self.noise, self.repeated = tuple(noise), True
+        self.differences = self.noise if differences is None else tuple(differences)
+        if variation is None:
+            self.variation, value, _ = self._estimate_variation(False)
+            if may_be_uneven and self.variation_samples and self.own:
+                plain = self.variation
+                self.noise, _ = self._estimate_noise(found.records, True)
+                self.variation, smooth, self.uneven = self._estimate_variation(True)
+                if smooth > value - BETTER:
+                    self.noise, self.variation = self.differences, plain
+                    self.uneven = np.zeros(len(self.shapes))
+            wider = np.sqrt(1.0 + len(self._cut) / found.known_from) if found.known_from else 1.0
+            self.variation, self.uneven = wider * self.variation, wider * self.uneven
+        else:
+            self.variation = variation
+        self._make_moments()
 
     def _usual(self) -> tuple[dict[int, float], dict[int, float]]:
         shared: dict[int, float] = {}
@@ -166,27 +199,24 @@ class LinearProblem:
                 (own if differs else shared)[k] = deviation / column.size
         return shared, own
 
-    def _make_moments(self) -> None:
+    def _make_shapes(self) -> None:
+        """The discrepancy: its shapes, which have no coefficients yet."""
         found = self.found
         K, channels = len(found.columns), len(found.records[0].channels)
         reach = max(float(r.depth.max()) for r in found.records)
         self.shape_values = []
+        squares = np.zeros(channels + 1)
         for r in found.records:
             values, phase = motion_shapes(r.time, r.depth, r.path, r.in_contact, reach, r.height)
             self.shape_values.append(values)
+            inside = r.predicted[r.in_contact]
+            squares += np.append((inside**2).sum(0), len(inside))
         count = len(phase)
         self.shapes = list(range(K, K + channels * count))
         self.size = K + channels * count
         self.forces = found.records[0].forces
-        self._errors = [self.model_error(r) for r in found.records]
-        self._calm = [self.calm(r) for r in found.records]
-        grams, squares = [], np.zeros(channels + 1)
-        for number, record in enumerate(found.records):
-            grams.append(self._moments_of(number))
-            inside = record.predicted[record.in_contact]
-            squares += np.append((inside**2).sum(0), len(inside))
-        self.moments = Moments(*map(np.array, zip(*grams, strict=True)))
         mean = np.sqrt(squares[:-1] / max(squares[-1], 1.0))
+        self.levels = self._levels(mean)
         force = np.linalg.norm(mean[self.forces])
         usual = np.where(np.isin(np.arange(channels), self.forces), force, mean)
         self.discrepancy = Discrepancy(
@@ -200,6 +230,30 @@ class LinearProblem:
             ],
             USUAL_SHARE * np.maximum(usual, 1e-3),
         )
+
+    def _levels(self, mean: np.ndarray) -> np.ndarray:
+        """Root mean square prediction of each condition over that of all, by channel [C, c]: slices
+        differ by a share of the force. Where next to nothing is predicted, by a share of little."""
+        out = np.ones((len(self.conditions), len(mean)))
+        for k, (first, *_) in enumerate(self.conditions.values()):
+            record = self.found.records[first]
+            inside = record.predicted[record.in_contact]
+            if len(inside):
+                own = np.sqrt((inside**2).mean(0))
+                out[k] = np.maximum(own / np.maximum(mean, 1e-12), LITTLE)
+        return out
+
+    def _estimate_noise(
+        self, records: Sequence[RecordSensitivity], uneven: bool
+    ) -> tuple[tuple[ChannelNoise, ...], bool]:
+        shapes = self.shape_values if uneven else None
+        return estimate_noise(records, self.own, list(self.usual_own), shapes)
+
+    def _make_moments(self) -> None:
+        found = self.found
+        self._calm = [self.calm(r) for r in found.records]
+        grams = [self._moments_of(number) for number in range(len(found.records))]
+        self.moments = Moments(*map(np.array, zip(*grams, strict=True)))
 
     def _parts(
         self, record: RecordSensitivity, shapes: np.ndarray
@@ -248,10 +302,22 @@ class LinearProblem:
         """Standard deviation of the noise at each row [m, c]."""
         return np.column_stack([n.deviations(record.near) for n in self.noise])
 
+    @property
+    def slice_levels(
+        self,
+    ) -> tuple[tuple[ChannelNoise, ...], np.ndarray, np.ndarray, tuple[ChannelNoise, ...]]:
+        """What was estimated of noise and slices, as `LinearProblem` takes it."""
+        return self.noise, self.variation, self.uneven, self.differences
+
     @functools.cached_property
     def scales(self) -> list[np.ndarray]:
         """The noise with `model_error` at the rows of each record, each [m, c]."""
-        return [np.hypot(self.noise_of(r), self.model_error(r)) for r in self.found.records]
+        return [np.hypot(self.apart_by(r), self.model_error(r)) for r in self.found.records]
+
+    def apart_by(self, record: RecordSensitivity) -> np.ndarray:
+        """Standard deviation at each row by which slices that are cut alike differ, beside what
+        they differ in as a whole: noise, and how uneven the food is [m, c]."""
+        return np.column_stack([n.deviations(record.near) for n in self.differences])
 
     def with_noise_beside(
         self, columns: Sequence[int], coefficients: np.ndarray
@@ -270,13 +336,16 @@ class LinearProblem:
             dc.replace(r, predicted=r.predicted + r.columns[:, :, list(columns)] @ g)
             for r, g in zip(self.found.records, coefficients, strict=True)
         ]
-        out.noise, _ = estimate_noise(records, self.own, list(self.usual_own))
+        out.differences, _ = self._estimate_noise(records, False)
+        out.noise = out.differences
+        if self.uneven.any():
+            out.noise, _ = self._estimate_noise(records, True)
         return out
 
     def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
         """The same problem, weights included, about another prediction of each record [m, c]."""
         records = [
-            dc.replace(record, predicted=values if record.bent is None else values + record.bent)
+            dc.replace(record, predicted=values + record.not_simulated)
             for record, values in zip(self.found.records, predicted, strict=True)
         ]
         return self._with_records(records, [self.size])
@@ -314,9 +383,7 @@ class LinearProblem:
         """The problem of what each record does not share with its replicates."""
         rests = unlike_others(self.found.records)
         records = zip(self.found.records, rests, strict=True)
-        return self.predicting(
-            [r.measured - rest - (0.0 if r.bent is None else r.bent) for r, rest in records]
-        )
+        return self.predicting([r.measured - rest - r.not_simulated for r, rest in records])
 
     def reduced(self, model: Model) -> np.ndarray:
         """Gram matrices with what is each record's own integrated out [R, K + 1, K + 1]."""
@@ -326,8 +393,18 @@ class LinearProblem:
             if len(self._reduced) > KEPT:
                 self._reduced.clear()
             gram = self.moments.gram
-            self._reduced[key] = np.array([integrate_out(G, own, variance) for G in gram])
+            self._reduced[key] = np.array(
+                [integrate_out(G, own, self._own_variance(model, r)) for r, G in enumerate(gram)]
+            )
         return self._reduced[key]
+
+    def _own_variance(self, model: Model, record: int) -> np.ndarray:
+        """Variance of the coefficients that are a record's own, in the order of `model.own`."""
+        out, z = model.variance.copy(), int(np.count_nonzero(self.uneven))
+        if z:
+            channel = self.discrepancy.channel[self.uneven > 0.0]
+            out[-z:] *= self.levels[self.condition_of[record]][channel] ** 2
+        return out
 
     def by_condition(self, model: Model, without: int | None = None) -> list[np.ndarray]:
         """Sums of `reduced` over the records of each condition; one record may be left out."""
@@ -361,18 +438,21 @@ class LinearProblem:
         free = [k for k in causes if kinds[k].per_record]
         added = [k for k in causes if not kinds[k].per_record]
         usual = {k: s for k, s in self.usual_own.items() if k not in unusual}
+        uneven = np.flatnonzero(self.uneven)
         deviations = [*self.variation, *usual.values(), *([PLAUSIBLE] * len(free))]
+        deviations += [*self.uneven[uneven]]
         prior = self.prior()
         prior[added] = 1.0 / PLAUSIBLE**2
         kept = [k for k in self.baseline if k not in (*added, *unusual)]
-        own = [*self.own, *usual, *free]
+        own = [*self.own, *usual, *free, *(self.shapes[k] for k in uneven)]
         return Model(own, np.array(deviations, float) ** 2, [*kept, *added], prior)
 
     def own_log_det(self, model: Model) -> float:
         """Logarithm of the determinant by which what is each record's own widens their spread."""
-        root = np.sqrt(model.variance)
-        at = np.ix_(range(len(self.moments.gram)), model.own, model.own)
-        inner = np.eye(len(root)) + root[:, None] * self.moments.gram[at] * root
+        records = range(len(self.moments.gram))
+        roots = np.sqrt([self._own_variance(model, r) for r in records])
+        at = np.ix_(records, model.own, model.own)
+        inner = np.eye(len(model.own)) + roots[:, :, None] * self.moments.gram[at] * roots[:, None]
         return float(np.linalg.slogdet(inner)[1].sum())
 
     def weighted(
@@ -396,35 +476,86 @@ class LinearProblem:
             out[k] = 1.0 / deviation**2
         return out
 
-    def _estimate_variation(self) -> np.ndarray:
-        """Maximum likelihood of the variation, from differences within conditions alone."""
-        if self.variation_samples == 0 or not self.own:
-            return np.ones(len(self.own))
-        grams: list[tuple[np.ndarray, float]] = []
-        own = [*self.own, *self.usual_own]
-        for group in self.conditions.values():
-            n, members = len(group), [self.found.records[k] for k in group]
-            error, near = self.model_error(members[0]), ~in_air(members)[:, 0]
-            for time, rest, columns in differences(members, own) if n > 1 else ():
-                scaled = np.sqrt(n / (n - 1.0)) * rest
-                X = np.concatenate([columns, scaled[:, :, None]], axis=2)
-                # Of n deviations from their mean n - 1 are independent.
-                grams.append((self._weighted(time, X, error[: len(time)], near), (n - 1.0) / n))
-        d = len(self.own)
+    def _estimate_variation(self, uneven: bool) -> tuple[np.ndarray, float, np.ndarray]:
+        """Variation of largest likelihood and prior from differences within conditions alone, minus
+        twice the logarithm of both, and how uneven the food is, 0 if that is not wanted."""
+        model, d = self.discrepancy, len(self.own)
         usual = np.array(list(self.usual_own.values()))
+        first, z = d + len(usual), len(self.shapes) if uneven else 0
+        if self.variation_samples == 0 or not self.own:
+            return np.ones(d), 0.0, np.zeros(len(self.shapes))
+        grams: list[np.ndarray] = []
+        weights: list[float] = []
+        log_det = 0.0
+        for level, group in zip(self.levels, self.conditions.values(), strict=True):
+            if len(group) > 1:
+                of_group, determinants = self._difference_grams(group, uneven)
+                scale = np.concatenate([np.ones(first), level[model.channel[:z]], [1.0]])
+                grams += [scale[:, None] * G * scale for G in of_group]
+                # Of n deviations from their mean n - 1 are independent.
+                weights += [(len(group) - 1.0) / len(group)] * len(group)
+                log_det += weights[-1] * determinants
+        G, weight = np.array(grams), np.array(weights)
+        channels, phases = len(self.noise) * uneven, (len(UNEVEN) - 1) * uneven
+        channel_of = model.channel[:z]
+        phase_of = np.minimum(model.phase[:z], len(UNEVEN) - 1)
+        in_food = model.phase[:z] < len(UNEVEN)
+        less = np.log(LESS)
+        middle = np.append(np.zeros(d), model.prior.channel[:channels] + less)
+        middle = np.append(middle, np.full(phases, less))
+        spread = np.full(len(middle), PRIOR["phase"])
+        spread[:d], spread[d : d + channels] = np.sqrt(20.0), PRIOR["channel"]
 
-        def objective(log_s: np.ndarray) -> float:
-            s2 = np.concatenate([np.exp(2.0 * log_s), usual**2])
-            total = 0.0
-            for G, weight in grams:
-                inner = np.eye(len(s2)) + np.sqrt(np.outer(s2, s2)) * G[:-1, :-1]
-                _, logdet = np.linalg.slogdet(inner)
-                rest = integrate_out(G, list(range(len(s2))), s2)[-1, -1]
-                total += weight * (logdet + rest)
-            return float(total) + 0.05 * float((log_s**2).sum())
+        def deviations(x: np.ndarray) -> np.ndarray:
+            of_phase = np.append(0.0, x[d + channels :])
+            shapes = np.exp(x[d : d + channels][channel_of] + of_phase[phase_of]) * in_food
+            return np.concatenate([np.exp(x[:d]), usual, shapes])
 
-        fit = minimize(objective, np.zeros(d), method="L-BFGS-B", bounds=[(-4.0, 2.5)] * d)
-        return np.exp(fit.x)
+        def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+            s = deviations(x)
+            A = np.eye(len(s)) + s[:, None] * G[:, :-1, :-1] * s
+            inverse, log_dets = np.linalg.inv(A), np.linalg.slogdet(A)[1]
+            b = s * G[:, :-1, -1]
+            found = np.einsum("nij,nj->ni", inverse, b)
+            away = (x - middle) / spread
+            value = weight @ (log_dets + G[:, -1, -1] - (found * b).sum(1)) + away @ away
+            by = 2.0 * weight @ (1.0 - np.diagonal(inverse, 0, 1, 2) - found**2)
+            of_shapes = by[first:] * in_food
+            of_channel = np.bincount(channel_of, of_shapes, channels)
+            of_phase = np.bincount(phase_of, of_shapes, phases + 1)[1:]
+            gradient = np.concatenate([by[:d], of_channel, of_phase])
+            return float(value), gradient + 2.0 * away / spread
+
+        ends = [(m - 5.0 * s, m + 3.0 * s) for m, s in zip(middle, spread, strict=True)]
+        bounds = [(-4.0, 2.5)] * d + ends[d:]
+        fit = minimize(objective, middle, jac=True, method="L-BFGS-B", bounds=bounds)
+        found, none = deviations(fit.x), np.zeros(len(self.shapes))
+        return found[:d], float(fit.fun) + log_det, found[first:] if uneven else none
+
+    def _difference_grams(
+        self, group: Sequence[int], uneven: bool
+    ) -> tuple[list[np.ndarray], float]:
+        """Gram matrices of what replicates do not share: own columns, shapes if they are wanted,
+        and the difference; and the logarithm of the determinant of the noise in all of them."""
+        n, members = len(group), [self.found.records[k] for k in group]
+        own = [*self.own, *self.usual_own]
+        d, size = len(own), len(own) + uneven * len(self.shapes)
+        error, near = self.model_error(members[0]), ~in_air(members)[:, 0]
+        out, log_det = [], 0.0
+        for time, rest, columns in differences(members, own):
+            m = len(time)
+            shapes = self.shape_values[group[0]][:m]
+            count = shapes.shape[1] if uneven else 0
+            G = np.zeros((size + 1, size + 1))
+            for c, noise in enumerate(self.noise):
+                at = np.array([*range(d), *range(d + c * count, d + (c + 1) * count), size])
+                scaled = np.sqrt(n / (n - 1.0)) * rest[:, c]
+                X = np.column_stack([columns[:, c], shapes[:, :count], scaled])
+                of_channel = X.T @ noise.solve(time, X, error[:m, c], near)
+                G[np.ix_(at, at)] += 0.5 * (of_channel + of_channel.T)
+                log_det += noise.log_det(time, error[:m, c], near)
+            out.append(G)
+        return out, log_det
 
     def model_error(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation of what the model is unsure of at each row by itself [m, c]: when a
@@ -437,15 +568,6 @@ class LinearProblem:
         if record.bent is not None:
             out = np.hypot(out, SECOND_ORDER * record.bent)
         return np.asarray(out)
-
-    def _weighted(
-        self, time: np.ndarray, X: np.ndarray, model_error: np.ndarray, near: np.ndarray
-    ) -> np.ndarray:
-        """Gram matrix of columns [m, c, k], weighted with noise and model error [k, k]."""
-        G = np.zeros((X.shape[2], X.shape[2]))
-        for c, noise in enumerate(self.noise):
-            G += X[:, c].T @ noise.solve(time, X[:, c], model_error[:, c], near)
-        return 0.5 * (G + G.T)
 
 
 def scaled_inverse(A: np.ndarray, cutoff: float = 1e-10) -> np.ndarray:

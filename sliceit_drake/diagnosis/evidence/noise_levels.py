@@ -74,10 +74,27 @@ class ChannelNoise:
             model_error: Standard deviation of what the model is unsure of at each row [m].
             near: Whether the knife is near the food [m]; None for all rows.
         """
-        error, out = np.broadcast_to(model_error, time.shape), np.empty(columns.shape)
+        out = np.empty(columns.shape)
+        for rows, covariance in self._parts(time, model_error, near):
+            out[rows] = covariance.solve(columns[rows])
+        return out
+
+    def log_det(
+        self, time: np.ndarray, model_error: np.ndarray, near: np.ndarray | None = None
+    ) -> float:
+        """Logarithm of the determinant of the covariance; arguments as in `solve`."""
+        parts = self._parts(time, model_error, near)
+        return float(sum(covariance.log_det() for _, covariance in parts))
+
+    def _parts(
+        self, time: np.ndarray, model_error: np.ndarray | float, near: np.ndarray | None
+    ) -> list[tuple[np.ndarray, MarkovCovariance]]:
+        """Masks of rows that are independent of others, and their covariance."""
+        error = np.broadcast_to(model_error, time.shape)
         parts = [(np.ones(len(time), bool), self)]
         if self.air is not None and near is not None:
             parts = [(near, self), (~near, self.air)]
+        out = []
         for rows, noise in parts:
             if rows.any():
                 # Jumps from step to step are as usual as what is rounded is large.
@@ -85,12 +102,15 @@ class ChannelNoise:
                     np.hypot(noise.white, noise.ar * np.sqrt(noise.stays)), error[rows]
                 )
                 covariance = MarkovCovariance(np.diff(time[rows]), noise.ar, noise.tau, white)
-                out[rows] = covariance.solve(columns[rows])
+                out.append((rows, covariance))
         return out
 
 
 def estimate_noise(
-    records: Sequence[RecordSensitivity], own: Sequence[int], zero: Sequence[int] = ()
+    records: Sequence[RecordSensitivity],
+    own: Sequence[int],
+    zero: Sequence[int] = (),
+    shapes: Sequence[np.ndarray] | None = None,
 ) -> tuple[tuple[ChannelNoise, ...], bool]:
     """Noise of each channel, pooled over the records.
 
@@ -99,6 +119,8 @@ def estimate_noise(
         own: Columns that differ from record to record; they are projected out of the differences.
         zero: Those of the sensor's zero, which differ too; they are projected out of what is in the
             air.
+        shapes: Of each record what slices may differ by in each channel [m, n]: it is projected out
+            of the differences as well.
 
     Returns:
         The noise of each channel, and whether it is from replicates: where no condition has two
@@ -113,9 +135,12 @@ def estimate_noise(
         alike, factor = [records[k] for k in members], len(members) / (len(members) - 1.0)
         air = in_air(alike)
         for grid, rest, columns in differences(alike, own):
-            rest = _beside(rest, columns)
-            whole.append((grid, rest, factor))
-            in_food.append((grid, np.where(air, np.nan, rest), factor))
+            rest, weight = _beside(rest, columns), factor
+            if shapes is not None:
+                rest, share = _smooth_left_out(rest, shapes[members[0]][: len(grid)])
+                weight = factor / share
+            whole.append((grid, rest, weight))
+            in_food.append((grid, np.where(air, np.nan, rest), weight))
         for grid, rest, columns in differences(alike, zero) if air.any() else ():
             known = np.full_like(rest, np.nan)
             known[air[:, 0]] = _beside(rest[air[:, 0]], columns[air[:, 0]])
@@ -178,6 +203,16 @@ def _beside(rest: np.ndarray, columns: np.ndarray) -> np.ndarray:
         return rest
     fitted, *_ = np.linalg.lstsq(flat, rest.ravel(), rcond=1e-6)
     return np.asarray(rest - (flat @ fitted).reshape(rest.shape))
+
+
+def _smooth_left_out(rest: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Values [m, c] less what shapes [m, n] take of each channel, and the share of their degrees of
+    freedom that this leaves."""
+    values, vectors = np.linalg.eigh(shapes.T @ shapes)
+    kept = values > 1e-6 * max(float(values[-1]), 1e-12)
+    basis = shapes @ (vectors[:, kept] / np.sqrt(values[kept]))
+    rows = max(int(shapes.any(1).sum()), 1)
+    return rest - basis @ (basis.T @ rest), 1.0 - min(kept.sum() / rows, 0.9)
 
 
 def _roughness(record: RecordSensitivity) -> Series:

@@ -55,7 +55,8 @@ def at_own_values(
             _moved(record, own, b, change)
             for record, b, change in zip(found.records, values, changes, strict=True)
         ]
-        again = LinearProblem(dc.replace(found, columns=[*found.columns, *added], records=records))
+        here = dc.replace(found, columns=[*found.columns, *added], records=records)
+        again = LinearProblem(here, may_be_uneven=problem.may_be_uneven)
     return again
 
 

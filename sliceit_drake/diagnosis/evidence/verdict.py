@@ -66,6 +66,8 @@ class DecisionRule:
         unknown: Size of the simulation's own error over the noise in contact from which on records
             that no cause explains are called unknown.
         trend: The same of what goes with the number of the slice.
+        known: The least gain where the food's file knows what the simulation gets wrong, times the
+            largest gain that the cause had in the file's own records, in which nothing had changed.
         most: Greatest number of findings.
     """
 
@@ -79,6 +81,7 @@ class DecisionRule:
     presence: float = 0.4
     unknown: float = 1.0
     trend: float = 0.4
+    known: float = 3.0
     most: int = 3
 
     def least_size(self, e: CauseEvidence) -> float:
@@ -320,6 +323,9 @@ def _refusal(
     problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule
 ) -> str:
     """Why a cause is not named; "" for one that may be."""
+    unchanged = rule.known * problem.found.known_chance.get(e.name, 0.0)
+    if not e.per_record and 0.0 < e.gain < unchanged:
+        return f"gains {e.gain:.0f}, where slices of the calibration may give {unchanged:.0f}"
     by_chance = (1.0 + (screening.largest >= e.deviations).sum()) / (len(screening.largest) + 1.0)
     if e.score <= 0.0 or by_chance > rule.alarm:
         return "gains no more than chance gives"
@@ -465,13 +471,12 @@ def _own_error(
 ) -> tuple[float, float, list[tuple[str, str, str, float]]]:
     """Of the simulation with what is named: relative to the force, to the noise, and where."""
     problem = wrong.problem
-    noise = np.array([n.deviation for n in problem.noise])
     squares, force, over, rows = 0.0, 0.0, 0.0, 0
     for record, values in zip(problem.found.records, wrong.values, strict=True):
         inside = record.in_contact
         squares += float((values[inside][:, problem.forces] ** 2).sum())
         force += float((record.measured[inside][:, problem.forces] ** 2).sum())
-        over += float(((values[inside] / noise) ** 2).mean(1).sum())
+        over += float(((values / problem.apart_by(record))[inside] ** 2).mean(1).sum())
         rows += int(inside.sum())
     parts = wrong.by_part()
     total = max(sum(parts.values()), 1e-30)

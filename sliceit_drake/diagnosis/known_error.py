@@ -1,0 +1,184 @@
+"""What a food's file knows of its simulation's own error, learnt from records and put to others.
+
+A law that is wrong along depth hides an effect that is smaller. Where the food was calibrated to
+cuts of the same kinds before, what the simulation gets wrong in them is known, and a diagnosis can
+ask what has changed since.
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.content_store import content_key
+from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.own_values import at_own_values
+from sliceit_drake.diagnosis.evidence.screen import screen
+from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
+from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
+from sliceit_drake.diagnosis.prediction import SlicePredictor
+from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.prediction.discrepancy import Covariates, motion_phases
+from sliceit_drake.prediction.simulator import Workers
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["known_of", "learn_known_error", "record_key", "way_of", "with_known_error"]
+
+ALIKE = (0.05, 0.03)
+"""Differences in the decimal logarithm of the speed and in the share of the draw up to which cuts
+are of one kind."""
+RESTING = 5e-3
+"""Way that a second at rest counts as, metres."""
+LEAST_DRAWS = 20
+"""Of what chance gives, where only gains are asked for."""
+DIGITS = 4
+"""Of the values that are kept."""
+
+
+def record_key(record: SliceRecord) -> str:
+    """Key of what a record measured."""
+    return content_key(record.time, record.position, record.measured_force)
+
+
+def way_of(record: RecordSensitivity) -> np.ndarray:
+    """Way of the knife since the edge was at the top of the food [m], metres; at rest it goes on by
+    `RESTING` a second, so that what relaxes has a place on it."""
+    _, rested = motion_phases(record.time, record.depth, record.path)
+    at_rest = np.maximum(np.diff(rested, prepend=0.0), 0.0)
+    way = record.path + RESTING * np.cumsum(at_rest)
+    return np.asarray(way - way[int(np.argmax(record.depth > 0.0))])
+
+
+def learn_known_error(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    cache: Path | None = None,
+    workers: Workers = None,
+    progress: Progress | None = None,
+) -> KnownError:
+    """What simulations of a calibrated food get wrong in records: the mean over each kind of cut,
+    once what its slices differ in as a whole (toughness, modulus, friction, height) is taken off;
+    and what each cause gains in a slice of each kind, seen from the others.
+
+    Args:
+        setup: Of the food at its calibrated values.
+        records: As `diagnose` takes them.
+        cache, workers, progress: As there.
+
+    Raises:
+        ConfigurationError: The records do not carry a diagnosis, naming file and field.
+        CuttingError: The prediction itself broke down.
+    """
+    check_records(records, setup.food)
+    keys = [record_key(r) for r in records]
+    records = without_lone_torques(records)
+    causes = open_causes([p.name for p in setup.parameters])
+    found = sensitivities(setup, records, causes, cache=cache, workers=workers, progress=progress)
+    predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
+    whole = LinearProblem(found, may_be_uneven=True)
+    problem = at_own_values(whole, predictor, progress)
+    own = own_coefficients(problem)
+    own -= own.mean(0)
+    rests = [
+        r.residual - r.columns[:, :, problem.own] @ a
+        for r, a in zip(problem.found.records, own, strict=True)
+    ]
+    known = _mean(problem, rests)
+    known.records = keys
+    fewest = min((len(m) for m in _cuts(problem)), default=0)
+    for left_out in range(fewest if fewest > 1 else 0):
+        others = _mean(problem, rests, left_out)
+        for name, gain in _gains(problem, others, left_out).items():
+            known.chance[name] = max(known.chance.get(name, 0.0), gain)
+    return known
+
+
+def _cuts(problem: LinearProblem) -> list[list[int]]:
+    """Records of each condition that cuts."""
+    first = (
+        (members, problem.found.records[members[0]]) for members in problem.conditions.values()
+    )
+    return [members for members, record in first if np.isfinite(_covariates(record).speed)]
+
+
+def _mean(
+    problem: LinearProblem, rests: Sequence[np.ndarray], left_out: int | None = None
+) -> KnownError:
+    """Means over each kind of cut of what is left of records, each [m, c]; one of each kind may be
+    left out."""
+    known = KnownError(channels=list(problem.found.records[0].channels), slices=0)
+    for cut in _cuts(problem):
+        members = [r for k, r in enumerate(cut) if k != left_out]
+        some = [problem.found.records[r] for r in members]
+        ways = [way_of(r) for r in some]
+        count = int(max(w[-1] for w in ways) / known.step) + 2
+        sums, rows = np.zeros((len(known.channels), count)), np.zeros(count)
+        for r, way in zip(members, ways, strict=True):
+            place = np.rint(way / known.step).astype(int) + 1
+            inside = (place >= 0) & (place < count)
+            rows += np.bincount(place[inside], minlength=count)
+            for c, values in enumerate(rests[r][inside].T):
+                sums[c] += np.bincount(place[inside], values, count)
+        seen = np.flatnonzero(rows)
+        means = [np.interp(np.arange(count), seen, s[seen] / rows[seen]) for s in sums]
+        values = [[float(f"{x:.{DIGITS}g}") for x in row] for row in means]
+        at = _covariates(some[0])
+        known.cuts.append(KnownErrorOfCut(float(10.0**at.speed), at.draw, values))
+        known.slices += len(members)
+    known.slices = max(known.slices, 1)
+    return known
+
+
+def _gains(problem: LinearProblem, known: KnownError, left_out: int) -> dict[str, float]:
+    """Gains of all causes in the slices that were left out, about the mean of the others."""
+    chosen = [cut[left_out] for cut in _cuts(problem)]
+    records = [problem.found.records[r] for r in chosen]
+    some = with_known_error(dc.replace(problem.found, records=records), known)
+    assert some is not None
+    noise, variation, uneven, differences = problem.slice_levels
+    wider = np.sqrt(1.0 + len(chosen) / known.slices)
+    levels = noise, wider * variation, wider * uneven, differences
+    screening = screen(LinearProblem(some, *levels), LEAST_DRAWS)
+    return {e.name: float(f"{e.gain:.{DIGITS}g}") for e in screening.causes}
+
+
+def known_of(known: KnownError, record: RecordSensitivity) -> np.ndarray | None:
+    """What is known of a record before it [m, c], N and Nm: 0 in channels of which nothing is, and
+    without food; None for a kind of cut of which nothing is."""
+    out, at = np.zeros_like(record.measured), _covariates(record)
+    if not np.isfinite(at.speed):
+        return out
+    away = [
+        np.hypot((np.log10(c.speed) - at.speed) / ALIKE[0], (c.draw - at.draw) / ALIKE[1])
+        for c in known.cuts
+    ]
+    if not away or min(away) > 1.0:
+        return None
+    values, place = known.cuts[int(np.argmin(away))].values, way_of(record) / known.step + 1.0
+    for k, name in enumerate(record.channels):
+        if name in known.channels:
+            row = values[known.channels.index(name)]
+            out[:, k] = np.interp(place, np.arange(len(row)), row, left=0.0, right=0.0)
+    return out
+
+
+def with_known_error(found: Sensitivities, known: KnownError) -> Sensitivities | None:
+    """Sensitivities about predictions to which what is known was added; None where records are of a
+    kind of cut of which nothing is known."""
+    records = []
+    for record in found.records:
+        added = known_of(known, record)
+        if added is None:
+            return None
+        records.append(dc.replace(record, predicted=record.predicted + added, known=added))
+    chance = dict(known.chance)
+    return dc.replace(found, records=records, known_from=known.slices, known_chance=chance)
+
+
+def _covariates(record: RecordSensitivity) -> Covariates:
+    return Covariates.of(record.time, record.depth, record.path)
