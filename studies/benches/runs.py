@@ -175,7 +175,10 @@ class _Bench:
         self.food = calibrated(self.model, food_records(earlier))
         # As `sliceit calibrate` leaves it.
         setup = setup_of_food(self.food, DIAGNOSIS_REFINEMENT)
-        self.food.known_error = learn_known_error(setup, earlier, output / "cache", workers=1)
+        try:
+            self.food.known_error = learn_known_error(setup, earlier, output / "cache", workers=1)
+        except ConfigurationError as error:
+            print(f"{law} {number}: what the simulation gets wrong is not in the file: {error}")
         write_json(
             self.folder.with_suffix(".json"),
             {"law": law, "draw": number, "seed": seed, "misfit": self.misfit}
