@@ -127,6 +127,22 @@ def test_a_record_of_nineteen_rows_is_refused_by_name():
     assert error.value.source == "slice_1.csv" and "40" in error.value.fix
 
 
+def test_a_draw_that_meets_a_tenth_of_what_the_board_pushes_back_with_is_no_late_contact():
+    records = slices()
+    r = records[1]
+    bottom = r.metadata.board_height
+    down = r.phase("slice") & (r.position[:, 2] < bottom + 5e-4)
+    assert down.any()
+    r.force = r.force.copy()
+    r.force[down, 2] += 20.0 * np.abs(r.force).max()
+    check_records(records, CUCUMBER)
+    # Where the sensor feels no more than in the air it begins at the board.
+    r.force[~down] = np.random.default_rng(0).normal(0.0, 0.05, (int((~down).sum()), 3))
+    with pytest.raises(ConfigurationError, match="below the top of the food") as error:
+        check_records(records, CUCUMBER)
+    assert error.value.field == "p_WK_z"
+
+
 @pytest.mark.parametrize(("shift", "words"), [(0.01, "10 mm below"), (-0.01, "10 mm above")])
 def test_a_board_that_is_not_under_its_food_is_refused_by_name(shift, words):
     records = slices()

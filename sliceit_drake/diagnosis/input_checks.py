@@ -29,6 +29,10 @@ CONTACT = 0.1
 CUTTING = ("slice", "second_pass", "hold", "retract")
 EARLY, LATE = 2e-3, 0.5
 """How far above the food contact may begin, metres, and how deep in it, of its height."""
+NEAR_BOARD = 1e-3
+"""Height over the board above which the food alone is met, metres."""
+OVER_AIR = 2.0
+"""Force over the greatest in the air at which a small one is of the food."""
 LASTING = 9
 """Rows over more than half of which a force is there for certain."""
 LEAST_ROWS = 40
@@ -283,10 +287,18 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
         # Weight, vibration or a sensor's zero: where contact begins does not show in the force.
         return
     # One row over it is noise, which has more rows over the food than in the air.
-    touches = cut & (median_filter(force, LASTING) > CONTACT * peak)
-    begins = int(np.argmax(touches))
-    if touches.any() and not EARLY >= above[begins] >= -LATE * height:
-        where = f"{1e3 * abs(above[begins]):.1f} mm {'above' if above[begins] > 0 else 'below'}"
+    lasting = median_filter(force, LASTING)
+    touches = cut & (lasting > CONTACT * peak)
+    begins = float(above[np.argmax(touches)])
+    if begins < -LATE * height:
+        # A draw may meet a tenth of what the board then pushes back with.
+        over_board = cut & (above > NEAR_BOARD - height)
+        in_air = lasting[~cut & (above > EARLY)].max(initial=0.0)
+        least = max(CONTACT * lasting[over_board].max(initial=0.0), OVER_AIR * in_air)
+        if (over_board & (lasting > least)).any():
+            begins = float(above[np.argmax(over_board & (lasting > least))])
+    if touches.any() and not EARLY >= begins >= -LATE * height:
+        where = f"{1e3 * abs(begins):.1f} mm {'above' if begins > 0 else 'below'}"
         raise ConfigurationError(
             f"the force begins {where} the top of the food, which is {1e3 * height:.0f} mm high",
             source=record.source,
