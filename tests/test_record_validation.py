@@ -369,6 +369,16 @@ def test_a_record_with_an_error_is_not_loaded_and_the_message_names_its_file(tmp
         load_record(file)
 
 
+def test_a_coarse_sensor_may_feel_nothing_in_the_air(tmp_path):
+    record = example_slice()
+    record.force = np.zeros_like(record.force)
+    whole = Phase("air", float(record.time[0]), float(record.time[-1]))
+    for phases in ([whole], [dc.replace(whole, label="slice")]):
+        record.metadata.motion.phases = phases
+        findings = check_table(record.table())
+        assert any(f.kind == "constant" for f in findings) == (phases != [whole])
+
+
 def test_a_record_with_a_warning_is_loaded(tmp_path):
     record = example_slice()
     record.force = record.force + 1.0

@@ -196,7 +196,7 @@ def _check_force(record: SliceRecord) -> None:
             field="time",
             fix=f"Give at least {LEAST_ROWS} rows, at the sensor's own rate.",
         )
-    if float(np.ptp(record.force_magnitude)) < 1e-9:
+    if float(np.ptp(record.force_magnitude)) < 1e-9 and not record.is_of_air:
         raise ConfigurationError(
             "has a constant force: there is nothing to compare",
             source=record.source,

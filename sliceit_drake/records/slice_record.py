@@ -161,6 +161,12 @@ class SliceRecord:
         """Bool mask [n] of the rows in phases with any of these labels."""
         return self._rows_of([p for p in self.metadata.motion.phases if p.label in labels])
 
+    @property
+    def is_of_air(self) -> bool:
+        """Whether all of its phases are in the air."""
+        labels = {phase.label for phase in self.metadata.motion.phases}
+        return labels == {"air"}
+
     def first_phase(self, label: str) -> np.ndarray:
         """Bool mask [n] of the rows in the first phase with this label; none if there is none."""
         return self._rows_of([p for p in self.metadata.motion.phases if p.label == label][:1])
