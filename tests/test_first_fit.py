@@ -1,5 +1,7 @@
 """The first fit of a calibration, on a coarse mesh."""
 
+import copy
+
 import numpy as np
 import pytest
 from test_calibration import bench_records, coarse_setup
@@ -43,6 +45,23 @@ def test_a_first_fit_passes_over_starts_that_break_down(monkeypatch):
     monkeypatch.setattr(module, "gauss_newton", breaks)
     with pytest.raises(CuttingError, match="widen the setup's ranges"):
         first_fit(coarse_setup(), bench_records(1), 1)
+
+
+def test_a_first_fit_takes_as_many_kinds_of_cut_as_its_picture_shows(monkeypatch):
+    taken = []
+
+    def stop(setup, records, workers):
+        taken.extend(record.metadata.condition for record in records)
+        raise CuttingError("enough")
+
+    monkeypatch.setattr(module, "coarse_predictor", stop)
+    (record,) = bench_records(1)
+    records = [copy.deepcopy(record) for _ in "aabcd"]
+    for name, each in zip("aabcd", records, strict=True):
+        each.metadata.condition = name
+    with pytest.raises(CuttingError, match="enough"):
+        first_fit(coarse_setup(), records, 1)
+    assert taken == ["a", "b", "c"]
 
 
 def test_a_calibration_goes_on_without_a_first_fit(tmp_path, monkeypatch, capsys):

@@ -23,6 +23,8 @@ __all__ = ["FirstFit", "first_fit", "fit_from_starts"]
 
 STEPS = 6
 """Of each fit."""
+MOST = 3
+"""Records that are fitted: as many as the picture shows."""
 
 
 @dc.dataclass
@@ -59,7 +61,7 @@ def first_fit(
 
     Args:
         setup: Food and ranges.
-        records: That are fitted.
+        records: Of which the first of each condition is fitted, of three conditions at most.
         workers: Threads.
         progress: Called with the fits done, and all of them.
 
@@ -67,7 +69,10 @@ def first_fit(
         ConfigurationError: A record cannot be predicted.
         CuttingError: No start leads to slices that can be cut.
     """
-    predictor = coarse_predictor(setup, records, workers)
+    first: dict[str, SliceRecord] = {}
+    for record in records:
+        first.setdefault(record.metadata.condition or record.name, record)
+    predictor = coarse_predictor(setup, list(first.values())[:MOST], workers)
     unit = fit_from_starts(predictor, progress)
     (row,) = predictor.predict([unit])
     return FirstFit(predictor, unit, row, predictor.error(row), force_band(predictor, unit))
