@@ -151,6 +151,7 @@ def test_what_was_so_at_the_calibration_is_not_named_again(cache, tmp_path):
     plain, found = (diagnose(setup, after, **settings, known=k) for k in (None, known))
     assert plain.verdict.misfit > 3.0
     assert found.verdict.names == [["sensor_zero"]] and found.verdict.misfit < 0.6
+    assert found.extended().known_error == known
     assert "skin" not in {e.name for s in found.verdict.screenings for e in s.causes if e.score > 0}
     # Where nothing has changed nothing is named, though a skin would be without the file.
     same = cut(63, "skin:2.0")

@@ -146,6 +146,7 @@ def diagnose(
             shifts=_shifts(problem, verdict.named),
             gain=None,
             remarks=list(remarks),
+            known=known,
         )
         if verdict.names:
             result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))

@@ -12,6 +12,7 @@ import numpy as np
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.known_error import KnownError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
@@ -52,6 +53,7 @@ class Diagnosis:
             whose numbers all records share.
         extension: The moments as the extended food predicts them; None as `gain`.
         next_experiment: What to cut next, where that was asked for.
+        known: What the food's file says that the simulation gets wrong.
     """
 
     verdict: Verdict
@@ -64,6 +66,7 @@ class Diagnosis:
     confirmation: Confirmation | None = None
     extension: LinearProblem | None = None
     next_experiment: NextExperiment | None = None
+    known: KnownError | None = None
 
     def confirm(
         self,
@@ -215,6 +218,7 @@ class Diagnosis:
         sure = self.verdict.kind in ("cause", "causes", "nothing")
         food, left = self._extension(self.verdict.findings) if sure else self._extension([], False)
         food.records = [r.name for r in self.problem.found.records]
+        food.known_error = self.known
         food.date = datetime.date.today().isoformat()
         food.note = f"Not in this file: {', '.join(left)}." if left else ""
         return food
