@@ -4,12 +4,14 @@ and what one motion cannot tell apart is said to be so.
 Records are cut and diagnosed by simulation, on the coarse mesh of the study of hidden effects.
 """
 
+import argparse
 import html
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sliceit_drake.cli import calibrate
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
@@ -161,6 +163,23 @@ def test_what_was_so_at_the_calibration_is_not_named_again(cache, tmp_path):
     again = diagnose(setup, before, **settings, known=known)
     assert again.verdict.names and again.problem.found.known_from == 0
     assert any("cannot tell what has changed" in remark for remark in again.remarks)
+
+
+def test_a_calibration_adds_what_it_gets_wrong_to_the_file_or_says_why_not(tmp_path, capsys):
+    dump_yaml(CalibratedFood(food=PROTOCOL.food, knife=PROTOCOL.knife), tmp_path / "food.yaml")
+    records = cut(61, "skin:2.0", slices=2)
+    options = argparse.Namespace(output=tmp_path, workers=1)
+    learn = calibrate._learn_known_error
+    learn([record.rows(np.arange(19) * 20) for record in records], options)
+    assert "What the simulation gets wrong is not in food.yaml: " in capsys.readouterr().out
+    assert load_calibrated_food(tmp_path / "food.yaml").known_error is None
+    learn(records, options)
+    known = load_calibrated_food(tmp_path / "food.yaml").known_error
+    # The skin that the food has not: some N where the edge enters, and what two slices show of it.
+    (cuts,) = known.cuts
+    vertical = cuts.values[known.channels.index("force_z")]
+    assert known.slices == 2 and 0.5 < np.abs(vertical).max() < 50.0
+    assert known.chance and min(known.chance.values()) >= 0.0
 
 
 def test_spikes_and_missing_rows_change_no_verdict(cache):
