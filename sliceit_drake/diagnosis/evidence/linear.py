@@ -118,6 +118,7 @@ class LinearProblem:
 
     Attributes:
         found: Sensitivities.
+        may_be_uneven: Whether slices may differ along the cut beside noise.
         noise: Of each channel.
         differences: By which slices that are cut alike differ beside `own`, as if it were noise:
             the same where the food is not `uneven`.
