@@ -287,6 +287,7 @@ READ_ONLY = {
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 2 --minutes 16
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 2 --minutes 17
         python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 3
+        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 2 --minutes 34
         python -m studies bench_score FOLDER --keep docs/results/benches_report.jsonl
         python -m studies bench_score docs/results/benches_report.jsonl
         python -m studies half_depth --output docs/figures/half_depth.png

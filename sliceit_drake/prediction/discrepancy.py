@@ -28,8 +28,10 @@ from scipy.linalg.lapack import dpotri, dtrtrs
 from scipy.optimize import minimize
 
 __all__ = [
+    "LESS",
     "PARTS",
     "PHASES",
+    "PRIOR",
     "USUAL_SHARE",
     "Covariates",
     "Discrepancy",
