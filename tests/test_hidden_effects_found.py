@@ -27,9 +27,8 @@ from studies.hidden_effects.truth import CAUSE_OF
 pytestmark = pytest.mark.second_tier
 
 REPLICATES = 100
-MIN_RIGHT, MOST_WRONG = 7, 1
-"""Fewest of the nine runs that must be right, and most that may name what was not hidden: the aim
-of the study is 5 %, with which two of nine are 1 chance in 14."""
+MIN_RIGHT = 10
+"""Fewest of the twelve runs that must be right."""
 SINGLE = (
     "skin",
     "bulk_relaxation",
@@ -56,10 +55,10 @@ def drawn(rng: np.random.Generator) -> list[Case]:
         return Case(name, kind, protocol, hidden, int(rng.integers(1, 2**31)))
 
     return [
-        *(case("single", "rich", str(e)) for e in rng.choice(SINGLE, 4, replace=False)),
-        case("single", "poor", str(rng.choice(OF_ONE_PRESS))),
+        *(case("single", "rich", str(e)) for e in rng.choice(SINGLE, 5, replace=False)),
+        *(case("single", "poor", str(e)) for e in rng.choice(OF_ONE_PRESS, 2, replace=False)),
         case("pairs", "rich", *PAIRS[rng.integers(len(PAIRS))]),
-        case("unknown", "rich", str(rng.choice(UNKNOWN))),
+        *(case("unknown", "rich", effect) for effect in UNKNOWN),
         case("nothing", "rich"),
         case("nothing", "poor"),
     ]
@@ -90,7 +89,7 @@ def test_a_fresh_draw_of_effects_is_diagnosed_rightly(tmp_path):
     seed = secrets.randbits(31)
     print(f"seed {seed}")
     cases = drawn(np.random.default_rng(seed))
-    assert len(cases) == 9
+    assert len(cases) >= 12
     for name in ("rich", "poor"):
         food_file(tmp_path, name).parent.mkdir(exist_ok=True)
         dump_yaml(model_food(protocol_named(name)), food_file(tmp_path, name))
@@ -118,4 +117,4 @@ def test_a_fresh_draw_of_effects_is_diagnosed_rightly(tmp_path):
     assert len(judgements) == len(cases)
     assert sum(j.right for j in judgements) >= MIN_RIGHT, f"seed {seed}\n{said}"
     # A confident wrong name is worse than a miss.
-    assert sum(map(is_wrong_name, judgements)) <= MOST_WRONG, f"seed {seed}\n{said}"
+    assert not any(map(is_wrong_name, judgements)), f"seed {seed}\n{said}"

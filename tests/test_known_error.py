@@ -16,7 +16,14 @@ from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.known_error import RESTING, known_of, way_of, with_known_error
+from sliceit_drake.diagnosis.known_error import (
+    RESTING,
+    _gains,
+    _mean,
+    known_of,
+    way_of,
+    with_known_error,
+)
 from sliceit_drake.prediction.discrepancy import Covariates, motion_shapes
 
 STEP = 5e-4
@@ -72,6 +79,16 @@ def test_what_is_known_is_no_own_error_and_stays_where_slices_are_predicted_anew
     np.testing.assert_allclose(squares, others, rtol=0.03)
     again = less.predicting([r.predicted for r in wrong.records])
     np.testing.assert_allclose(again.moments.gram, less.moments.gram, rtol=1e-9)
+
+
+def test_slices_of_one_condition_at_speeds_far_apart_tell_nothing_of_each_other():
+    found = problem(5).found
+    for factor, tells in ((1.0, True), (1.5, False)):
+        records = list(found.records)
+        records[0] = dc.replace(records[0], time=records[0].time / factor)
+        some = LinearProblem(Sensitivities(found.columns, records))
+        rests = [r.residual for r in records]
+        assert bool(_gains(some, _mean(some, rests, 0), 0)) == tells
 
 
 def test_a_file_keeps_what_is_known_and_refuses_what_is_no_table(tmp_path):

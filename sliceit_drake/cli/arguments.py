@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = [
+    "DIAGNOSIS_REFINEMENT",
     "ONE_CUT",
     "SEEDS",
     "WORKERS",
@@ -41,6 +42,8 @@ ONE_CUT = "scenarios/cucumber_measured.yaml"
 PROTOCOL = "calibration/protocols/rich.yaml"
 DASK = "dask"
 SEEDS = (0, math.inf)
+DIAGNOSIS_REFINEMENT = 0.75
+"""Elements along an edge for changes of the force, relative to the food's mesh."""
 WORKERS = (1, 10_000)
 
 

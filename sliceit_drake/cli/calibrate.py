@@ -34,7 +34,12 @@ import math
 import os
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import WORKERS, add_output_folder, check_numbers
+from sliceit_drake.cli.arguments import (
+    DIAGNOSIS_REFINEMENT,
+    WORKERS,
+    add_output_folder,
+    check_numbers,
+)
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
@@ -50,8 +55,6 @@ __all__ = ["add_arguments", "run"]
 
 TRIALS = 500
 """Of a search."""
-REFINEMENT = 0.75
-"""Of the mesh on which changes of the force are computed, as `sliceit diagnose` does."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -292,7 +295,7 @@ def _learn_known_error(records: "Sequence[SliceRecord]", options: argparse.Names
     try:
         with StageBars() as bars:
             food.known_error = learn_known_error(
-                setup_of_food(food, REFINEMENT),
+                setup_of_food(food, DIAGNOSIS_REFINEMENT),
                 records,
                 workers=options.workers,
                 progress=lambda done, all: bars.show("what it gets wrong", done, all),

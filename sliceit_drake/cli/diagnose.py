@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sliceit_drake.cli.arguments import (
+    DIAGNOSIS_REFINEMENT,
     SEEDS,
     WORKERS,
     add_cluster_arguments,
@@ -76,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refinement",
         type=float,
-        default=0.75,
+        default=DIAGNOSIS_REFINEMENT,
         help="elements along an edge for changes of the force, relative to the food's mesh; the"
         " force itself is computed with one and a half times as many (default 0.75)",
     )

@@ -295,8 +295,9 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
         over_board = cut & (above > NEAR_BOARD - height)
         in_air = lasting[~cut & (above > EARLY)].max(initial=0.0)
         least = max(CONTACT * lasting[over_board].max(initial=0.0), OVER_AIR * in_air)
-        if (over_board & (lasting > least)).any():
-            begins = float(above[np.argmax(over_board & (lasting > least))])
+        meets = over_board & (lasting > least)
+        if meets.any():
+            begins = float(above[np.argmax(meets)])
     if touches.any() and not EARLY >= begins >= -LATE * height:
         where = f"{1e3 * abs(begins):.1f} mm {'above' if begins > 0 else 'below'}"
         raise ConfigurationError(

@@ -16,7 +16,7 @@ from sliceit_drake.content_store import content_key
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, wider
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
@@ -139,10 +139,12 @@ def _gains(problem: LinearProblem, known: KnownError, left_out: int) -> dict[str
     chosen = [cut[left_out] for cut in _cuts(problem)]
     records = [problem.found.records[r] for r in chosen]
     some = with_known_error(dc.replace(problem.found, records=records), known)
-    assert some is not None
+    if some is None:
+        # Slices of one condition that went at speeds too far apart tell nothing of each other.
+        return {}
     noise, variation, uneven, differences = problem.slice_levels
-    wider = np.sqrt(1.0 + len(chosen) / known.slices)
-    levels = noise, wider * variation, wider * uneven, differences
+    by = wider(len(chosen), known.slices)
+    levels = noise, by * variation, by * uneven, differences
     screening = screen(LinearProblem(some, *levels), LEAST_DRAWS)
     return {e.name: float(f"{e.gain:.{DIGITS}g}") for e in screening.causes}
 

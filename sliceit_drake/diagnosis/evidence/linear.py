@@ -52,6 +52,7 @@ __all__ = [
     "fitted_covariance",
     "integrate_out",
     "scaled_inverse",
+    "wider",
 ]
 
 USUAL = {
@@ -185,8 +186,9 @@ class LinearProblem:
                 if smooth > value - BETTER:
                     self.noise, self.variation = self.differences, plain
                     self.uneven = np.zeros(len(self.shapes))
-            wider = np.sqrt(1.0 + len(self._cut) / found.known_from) if found.known_from else 1.0
-            self.variation, self.uneven = wider * self.variation, wider * self.uneven
+            if found.known_from:
+                by = wider(len(self._cut), found.known_from)
+                self.variation, self.uneven = by * self.variation, by * self.uneven
         else:
             self.variation = variation
         self._make_moments()
@@ -554,7 +556,8 @@ class LinearProblem:
                 X = np.column_stack([columns[:, c], shapes[:, :count], scaled])
                 of_channel = X.T @ noise.solve(time, X, error[:m, c], near)
                 G[np.ix_(at, at)] += 0.5 * (of_channel + of_channel.T)
-                log_det += noise.log_det(time, error[:m, c], near)
+                if self.may_be_uneven:
+                    log_det += noise.log_det(time, error[:m, c], near)
             out.append(G)
         return out, log_det
 
@@ -569,6 +572,11 @@ class LinearProblem:
         if record.bent is not None:
             out = np.hypot(out, SECOND_ORDER * record.bent)
         return np.asarray(out)
+
+
+def wider(slices: int, known_from: int) -> float:
+    """Factor on the spread of slices about the mean of so many others, which differ as well."""
+    return float(np.sqrt(1.0 + slices / known_from))
 
 
 def scaled_inverse(A: np.ndarray, cutoff: float = 1e-10) -> np.ndarray:
