@@ -358,6 +358,10 @@ def test_a_signature_is_what_a_refit_leaves(monkeypatch):
     assert large.size == pytest.approx(2.0 * small.size, rel=1e-3)
     found = sizes.size_for("cross_talk", 2.0)
     assert found is not None and found[1].size == pytest.approx(2.0, rel=0.05)
+    # A size that has no meaning is not hidden, however small the effect is beside what is wrong.
+    with monkeypatch.context() as patched:
+        patched.setattr(HIDDEN["cross_talk"], "most", 0.5 * found[0])
+        assert sizes.size_for("cross_talk", 2.0) is None
     for name in set(HIDDEN) - {"cross_talk", "axis_gain", "pure_delay"}:
         monkeypatch.delitem(HIDDEN, name)
     assert sizes.group("cross_talk", found[1]) == {"sensor_tilt"}

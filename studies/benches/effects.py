@@ -37,6 +37,7 @@ class HiddenEffect(Effect):
             height.
         by_slice: Whether slices of one condition differ by it.
         value: Parameter of a right cause that stands for `size`; "" where none does.
+        most: Largest size that has a meaning; a relaxation of more than all of a force is none.
     """
 
     right: frozenset[str] = frozenset()
@@ -44,6 +45,7 @@ class HiddenEffect(Effect):
     trend = False
     by_slice = False
     value = ""
+    most = np.inf
 
 
 class StretchedRelaxation(HiddenEffect):
@@ -51,7 +53,7 @@ class StretchedRelaxation(HiddenEffect):
     is back in a straight line over 0.6 mm."""
 
     right, group = frozenset({"viscoelasticity"}), "material"
-    typical, least = 0.2, 0.0
+    typical, least, most = 0.2, 0.0, 0.8
     time, way = 0.3, 6e-4
 
     def respond(self, series: Series) -> None:
@@ -73,7 +75,7 @@ class SaturatingRate(HiddenEffect):
     """Toughness 1 + size tanh(ln(v / v0) / 1.2), which a rest keeps."""
 
     right, group, trend = frozenset({"toughness_rate"}), "material", True
-    typical = 0.15
+    typical, most = 0.15, 0.6
     _speed = 0.02
 
     def drive(self, now: Now) -> None:
@@ -87,7 +89,7 @@ class SlowFriction(HiddenEffect):
     """Friction higher by size / (1 + (v / 8 mm/s)^2)."""
 
     right, group = frozenset({"static_friction"}), "material"
-    typical, least = 1.0, 0.0
+    typical, least, most = 1.0, 0.0, 4.0
 
     def drive(self, now: Now) -> None:
         now.friction *= 1.0 + self.size / (1.0 + (now.speed / 8e-3) ** 2)
@@ -124,7 +126,7 @@ class BluntStart(HiddenEffect):
     path."""
 
     right, group = frozenset({"bluntness"}), "material"
-    typical, least = 0.5, 0.0
+    typical, least, most = 0.5, 0.0, 2.0
 
     def drive(self, now: Now) -> None:
         now.toughness *= 1.0 + self.size * max(0.0, 1.0 - now.travel / 5e-3)
@@ -135,7 +137,7 @@ class WornEdge(HiddenEffect):
 
     right, group = frozenset({"dulling"}), "material"
     trend = by_slice = True
-    typical, least = 0.3, 0.0
+    typical, least, most = 0.3, 0.0, 1.0
 
     def drive(self, now: Now) -> None:
         now.toughness *= 1.0 + self.size * -np.expm1(-self.facts.index / 8.0)
@@ -145,7 +147,7 @@ class ShyDraw(HiddenEffect):
     """A draw that helps less, by size (1 - exp(-xi))."""
 
     right, group, trend = frozenset({"slice_push_law"}), "material", True
-    typical = 0.4
+    typical, most = 0.4, 1.5
 
     def drive(self, now: Now) -> None:
         if now.press > 1e-6:
@@ -156,7 +158,7 @@ class SaggingBelly(HiddenEffect):
     """A section that bulges in its lower third, by the share size."""
 
     right, group = frozenset({"section_shape"}), "depth"
-    typical = 0.15
+    typical, most = 0.15, 0.5
 
     def reshape(self, p: np.ndarray) -> np.ndarray:
         up = p[:, 2] / max(self.facts.height, 1e-9)
@@ -170,7 +172,7 @@ class SeedCavity(HiddenEffect):
     softer."""
 
     right, group = frozenset({"core"}), "depth"
-    typical = 0.4
+    typical, most = 0.4, 0.9
 
     def _inside(self, at: Tissue) -> np.ndarray:
         width, height = max(self.facts.width, 1e-9), max(self.facts.height, 1e-9)
@@ -178,10 +180,10 @@ class SeedCavity(HiddenEffect):
         return (x / 0.27) ** 2 + (z / 0.2) ** 2 < 1.0
 
     def toughness(self, at: Tissue) -> np.ndarray | float:
-        return 1.0 - min(self.size, 0.95) * self._inside(at)
+        return 1.0 - self.size * self._inside(at)
 
     def stiffness(self, at: Tissue) -> np.ndarray | float:
-        return 1.0 - 0.5 * min(self.size, 0.95) * self._inside(at)
+        return 1.0 - 0.5 * self.size * self._inside(at)
 
 
 class TiltedBoard(HiddenEffect):
@@ -189,7 +191,7 @@ class TiltedBoard(HiddenEffect):
     to."""
 
     right, trend = frozenset({"board_height"}), True
-    unit, typical = "m", 4e-4
+    unit, typical, most = "m", 4e-4, 1.5e-3
 
     def drive(self, now: Now) -> None:
         now.knife_shift[2] -= self.size * (1.0 + 8.0 * now.position[0])
@@ -199,7 +201,7 @@ class SoftMat(HiddenEffect):
     """A mat on the board that gives more the more it is pressed: F / (1 + size (F / 10 N)^0.7)."""
 
     right = frozenset({"board_stiffness"})
-    typical, least = 0.5, 0.0
+    typical, least, most = 0.5, 0.0, 3.0
 
     def respond(self, series: Series) -> None:
         force = np.abs(series.board[:, 5:])
@@ -211,7 +213,7 @@ class ArmPlay(HiddenEffect):
     it."""
 
     right, every_coupling_step = frozenset({"arm_compliance"}), True
-    unit, typical, least = "m", 5e-4, 0.0
+    unit, typical, least, most = "m", 5e-4, 0.0, 2e-3
     _given = 0.0
 
     def _follows(self, force: float, period: float) -> float:
@@ -227,7 +229,7 @@ class SlidingHolder(ArmPlay):
     """A holder of the food that gives along the edge in the same way."""
 
     right = frozenset({"holder_compliance"})
-    unit, typical = "m", 2e-3
+    unit, typical, most = "m", 2e-3, 5e-3
 
     def drive(self, now: Now) -> None:
         now.food_shift[0] -= self._follows(float(now.force[0]), now.period)
@@ -270,7 +272,7 @@ class AxisGain(HiddenEffect):
     """A gain that is off by the share size in the press, and by a quarter of it along the edge."""
 
     right = frozenset({"sensor_gain"})
-    typical = 0.12
+    typical, most = 0.12, 0.6
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
         share = np.array([0.25, 1.0, 0.25, 0.25, 0.25, 1.0])
@@ -281,7 +283,7 @@ class CrossTalk(HiddenEffect):
     """The press shows in the two lateral forces, which turn nothing: it is no rotation."""
 
     right = frozenset({"sensor_tilt"})
-    typical = 0.08
+    typical, most = 0.08, 0.5
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
         out = wrench.copy()
@@ -294,7 +296,7 @@ class PureDelay(HiddenEffect):
 
     right = frozenset({"sensor_delay"})
     value = "delay"
-    unit, typical, least = "s", 0.02, 0.0
+    unit, typical, least, most = "s", 0.02, 0.0, 0.05
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
         return np.asarray(interpolated(series.time - self.size, series.time, wrench))
@@ -305,7 +307,7 @@ class RingingFilter(HiddenEffect):
 
     right = frozenset({"sensor_delay"})
     value = "delay"
-    unit, typical, least = "s", 0.02, 0.0
+    unit, typical, least, most = "s", 0.02, 0.0, 0.05
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
         if self.size == 0.0:
@@ -326,7 +328,7 @@ class SideMass(HiddenEffect):
 
     right = frozenset({"tool_weight"})
     value = "mass"
-    unit, typical = "kg", 0.2
+    unit, typical, most = "kg", 0.2, 0.5
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
         acceleration = np.gradient(series.v, series.period, axis=0)

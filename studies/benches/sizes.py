@@ -161,7 +161,8 @@ class Sizes:
             name: Of an effect.
             wanted: Standardised size.
         """
-        size, limit = HIDDEN[name].typical, LARGEST * HIDDEN[name].typical
+        kind = HIDDEN[name]
+        size, limit = kind.typical, min(LARGEST * kind.typical, kind.most)
         found: tuple[float, Signature] | None = None
         for _ in range(6):
             try:
