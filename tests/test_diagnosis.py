@@ -293,6 +293,17 @@ def test_a_wave_is_as_large_as_over_the_noise_at_its_frequency(slow, white):
     assert size >= standardised_size(whole, [skin], ones)
 
 
+def test_what_a_named_cause_can_do_is_no_size_of_the_next_one():
+    whole = problem(3)
+    skin, alike, rate = (whole.found.index("cause", n)[0] for n in ("skin", "skin_like", "rate"))
+    one = np.ones(1)
+    alone, beside_other, beside_it = (
+        standardised_size(whole, [skin], one, beside=b) for b in ([], [rate], [alike])
+    )
+    # The two fall off by 2 and 1.8 mm; a rate is all that the base is, and goes with the speed.
+    assert beside_it < 0.15 * alone and beside_other > 0.6 * alone
+
+
 def test_noise_is_estimated_anew_beside_an_effect_that_differs_by_record():
     found = problem(4, replicates=6).found
     rate = [c.name for c in found.columns].index("rate")

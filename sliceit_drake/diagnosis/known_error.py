@@ -16,9 +16,8 @@ from sliceit_drake.content_store import content_key
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem, wider
+from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
-from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
@@ -34,8 +33,6 @@ ALIKE = (0.05, 0.03)
 are of one kind."""
 RESTING = 5e-3
 """Way that a second at rest counts as, metres."""
-LEAST_DRAWS = 20
-"""Of what chance gives, where only gains are asked for."""
 DIGITS = 4
 """Of the values that are kept."""
 
@@ -62,8 +59,7 @@ def learn_known_error(
     progress: Progress | None = None,
 ) -> KnownError:
     """What simulations of a calibrated food get wrong in records: the mean over each kind of cut,
-    once what its slices differ in as a whole (toughness, modulus, friction, height) is taken off;
-    and what each cause gains in a slice of each kind, seen from the others.
+    once what its slices differ in as a whole (toughness, modulus, friction, height) is taken off.
 
     Args:
         setup: Of the food at its calibrated values.
@@ -77,7 +73,8 @@ def learn_known_error(
     check_records(records, setup.food)
     keys = [record_key(r) for r in records]
     records = without_lone_torques(records)
-    causes = open_causes([p.name for p in setup.parameters])
+    every_sensor = {name for name, _ in USUAL}
+    causes = [c for c in open_causes([p.name for p in setup.parameters]) if c.name in every_sensor]
     found = sensitivities(setup, records, causes, cache=cache, workers=workers, progress=progress)
     predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
     whole = LinearProblem(found, may_be_uneven=True)
@@ -90,30 +87,19 @@ def learn_known_error(
     ]
     known = _mean(problem, rests)
     known.records = keys
-    fewest = min((len(m) for m in _cuts(problem)), default=0)
-    for left_out in range(fewest if fewest > 1 else 0):
-        others = _mean(problem, rests, left_out)
-        for name, gain in _gains(problem, others, left_out).items():
-            known.chance[name] = max(known.chance.get(name, 0.0), gain)
     return known
 
 
 def _cuts(problem: LinearProblem) -> list[list[int]]:
     """Records of each condition that cuts."""
-    first = (
-        (members, problem.found.records[members[0]]) for members in problem.conditions.values()
-    )
-    return [members for members, record in first if np.isfinite(_covariates(record).speed)]
+    records = problem.found.records
+    return [members for members in problem.conditions.values() if records[members[0]].cut]
 
 
-def _mean(
-    problem: LinearProblem, rests: Sequence[np.ndarray], left_out: int | None = None
-) -> KnownError:
-    """Means over each kind of cut of what is left of records, each [m, c]; one of each kind may be
-    left out."""
+def _mean(problem: LinearProblem, rests: Sequence[np.ndarray]) -> KnownError:
+    """Means over each kind of cut of what is left of records, each [m, c]."""
     known = KnownError(channels=list(problem.found.records[0].channels), slices=0)
-    for cut in _cuts(problem):
-        members = [r for k, r in enumerate(cut) if k != left_out]
+    for members in _cuts(problem):
         some = [problem.found.records[r] for r in members]
         ways = [way_of(r) for r in some]
         count = int(max(w[-1] for w in ways) / known.step) + 2
@@ -134,27 +120,13 @@ def _mean(
     return known
 
 
-def _gains(problem: LinearProblem, known: KnownError, left_out: int) -> dict[str, float]:
-    """Gains of all causes in the slices that were left out, about the mean of the others."""
-    chosen = [cut[left_out] for cut in _cuts(problem)]
-    records = [problem.found.records[r] for r in chosen]
-    some = with_known_error(dc.replace(problem.found, records=records), known)
-    if some is None:
-        # Slices of one condition that went at speeds too far apart tell nothing of each other.
-        return {}
-    noise, variation, uneven, differences = problem.slice_levels
-    by = wider(len(chosen), known.slices)
-    levels = noise, by * variation, by * uneven, differences
-    screening = screen(LinearProblem(some, *levels), LEAST_DRAWS)
-    return {e.name: float(f"{e.gain:.{DIGITS}g}") for e in screening.causes}
-
-
 def known_of(known: KnownError, record: RecordSensitivity) -> np.ndarray | None:
     """What is known of a record before it [m, c], N and Nm: 0 in channels of which nothing is, and
     without food; None for a kind of cut of which nothing is."""
-    out, at = np.zeros_like(record.measured), _covariates(record)
-    if not np.isfinite(at.speed):
+    out = np.zeros_like(record.measured)
+    if not record.cut:
         return out
+    at = _covariates(record)
     away = [
         np.hypot((np.log10(c.speed) - at.speed) / ALIKE[0], (c.draw - at.draw) / ALIKE[1])
         for c in known.cuts
@@ -178,8 +150,7 @@ def with_known_error(found: Sensitivities, known: KnownError) -> Sensitivities |
         if added is None:
             return None
         records.append(dc.replace(record, predicted=record.predicted + added, known=added))
-    chance = dict(known.chance)
-    return dc.replace(found, records=records, known_from=known.slices, known_chance=chance)
+    return dc.replace(found, records=records, known_from=known.slices)
 
 
 def _covariates(record: RecordSensitivity) -> Covariates:

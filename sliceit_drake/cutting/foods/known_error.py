@@ -33,8 +33,6 @@ class KnownError:
         channels: Names of the channels.
         cuts: A mean for each kind of cut, beside what its slices differ in as a whole.
         slices: Number of all slices.
-        chance: Largest gain of each cause, by name, in slices of which each was set beside the mean
-            of the others: what a diagnosis finds where nothing has changed.
         records: Keys of the records, by their content: of these it tells nothing more.
     """
 
@@ -44,7 +42,6 @@ class KnownError:
     `diagnosis.known_error.way_of`."""
     cuts: list[KnownErrorOfCut] = dc.field(default_factory=list)
     slices: int = 1
-    chance: dict[str, float] = dc.field(default_factory=dict)
     records: list[str] = dc.field(default_factory=list)
 
     def check(self, where: str) -> None:

@@ -110,6 +110,11 @@ class RecordSensitivity:
         return np.sum(parts, axis=0) if parts else 0.0
 
     @property
+    def cut(self) -> bool:
+        """Whether food is cut, not the bare board pressed or the knife moved in the air."""
+        return bool(self.in_contact.any() and self.height > 0.0)
+
+    @property
     def forces(self) -> list[int]:
         """Numbers of the channels that are forces."""
         return [k for k, name in enumerate(self.channels) if name.startswith("force")]
@@ -161,7 +166,6 @@ class Sensitivities:
         warnings: Such as causes whose slices broke down: their column is 0 for that record.
         elements: Most tetrahedra of a slice's food.
         known_from: Number of the slices that an error that is known was learnt from.
-        known_chance: Gains of causes there, where nothing had changed.
     """
 
     columns: list[Column]
@@ -169,7 +173,6 @@ class Sensitivities:
     warnings: list[str] = dc.field(default_factory=list)
     elements: int = 0
     known_from: int = 0
-    known_chance: dict[str, float] = dc.field(default_factory=dict)
 
     def index(self, kind: str, name: str | None = None, scan: float | None = None) -> list[int]:
         """Numbers of the columns of a kind; of a name, of a value of the scan, if given."""

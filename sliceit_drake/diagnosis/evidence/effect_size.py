@@ -130,10 +130,12 @@ def standardised_size(
     coefficients: np.ndarray,
     wrong: OwnError | None = None,
     found: bool = False,
+    beside: Sequence[int] = (),
 ) -> float:
     """Root mean square of an effect over sqrt(noise^2 + discrepancy^2), in the rows and channels in
-    which it acts, once the base parameters are refitted to it. The noise is with what the model is
-    unsure of at each row (`LinearProblem.model_error`), as when exactly a force jumps.
+    which it acts, once the base parameters, and causes that are in the model before, are refitted
+    to it. The noise is with what the model is unsure of at each row (`LinearProblem.model_error`),
+    as when exactly a force jumps.
 
     Args:
         problem: The records.
@@ -141,8 +143,10 @@ def standardised_size(
         coefficients: Of the columns [n], or of each record [R, n].
         wrong: The discrepancy beside the effect; None for an effect that differs by record.
         found: Whether only what was found of it counts, not what it may be.
+        beside: Numbers of the columns of those causes.
     """
-    records, base = problem.found.records, problem.base
+    records, kinds = problem.found.records, problem.found.columns
+    base = [*problem.base, *(k for k in beside if not kinds[k].per_record)]
     coefficients = np.broadcast_to(coefficients, (len(records), len(columns)))
     scales = _scales(problem, wrong, found)
     effects, free = [], []

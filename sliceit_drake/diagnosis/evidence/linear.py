@@ -63,6 +63,8 @@ USUAL = {
 """What every sensor has, by cause and parameter: usual standard deviation in its unit, and whether
 that differs from record to record. Only more than that is a finding, or what should differ and is
 the same in all records."""
+SAME_SENSOR = 0.1
+"""Share of that by which a sensor differs from what it was in records that were there before."""
 FINE_MESH = 0.3
 """Standard deviation of the discretisation's error of each row, in that of the mesh column."""
 SECOND_ORDER = 0.5
@@ -71,8 +73,9 @@ PLAUSIBLE = 2.0
 """Standard deviation of a cause's number before the data, in its size."""
 TOLERANCE = 0.1
 """Of the gradient of the log-likelihood where sizes count as found."""
-UNEVEN = ("in", "rest", "out", "again")
-"""Phases in which slices of a food are uneven: the first of `PHASES`."""
+UNEVEN = ("in", "rest", "out", "again", "board")
+"""Phases in which slices of a food are uneven: the first of `PHASES`. In the board too: what of a
+slice is not parted yet is pressed on it."""
 LITTLE = 0.1
 """Least share of the usual force of a channel that slices differ in."""
 BETTER = 20.0
@@ -127,7 +130,7 @@ class LinearProblem:
         conditions: Numbers of the records of each condition.
         condition_of: Number of the condition of each record [R].
         base, own, numerical: Numbers of columns.
-        mesh: Number of the column of the mesh; None without one.
+        mesh: Number of the column of the mesh; None without one, or where an error is known.
         usual: Numbers of columns of `USUAL` that all records share, and their standard deviations.
         usual_own: The same of those that are each record's own.
         shapes: Numbers of the columns appended for the discrepancy (`prediction.discrepancy`).
@@ -157,8 +160,10 @@ class LinearProblem:
         self.found, self.may_be_uneven = found, may_be_uneven
         self.base = found.index("base")
         self.own = found.index("record")
-        self.numerical = found.index("numerical")
-        self.mesh = next(iter(found.index("numerical", MESH.name)), None)
+        # What step and mesh change is of the error that is known.
+        known = found.known_from > 0
+        self.numerical = [] if known else found.index("numerical")
+        self.mesh = None if known else next(iter(found.index("numerical", MESH.name)), None)
         self.conditions = replicates(found.records)
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]
@@ -199,6 +204,8 @@ class LinearProblem:
         for k, column in enumerate(self.found.columns):
             if (column.name, column.parameter) in USUAL:
                 deviation, differs = USUAL[column.name, column.parameter]
+                same = self.found.known_from and not differs
+                deviation *= SAME_SENSOR if same else 1.0
                 (own if differs else shared)[k] = deviation / column.size
         return shared, own
 
@@ -236,12 +243,13 @@ class LinearProblem:
 
     def _levels(self, mean: np.ndarray) -> np.ndarray:
         """Root mean square prediction of each condition over that of all, by channel [C, c]: slices
-        differ by a share of the force. Where next to nothing is predicted, by a share of little."""
-        out = np.ones((len(self.conditions), len(mean)))
+        differ by a share of the force. Where next to nothing is predicted, by a share of little; 0
+        where nothing is cut."""
+        out = np.zeros((len(self.conditions), len(mean)))
         for k, (first, *_) in enumerate(self.conditions.values()):
             record = self.found.records[first]
-            inside = record.predicted[record.in_contact]
-            if len(inside):
+            if record.cut:
+                inside = record.predicted[record.in_contact]
                 own = np.sqrt((inside**2).mean(0))
                 out[k] = np.maximum(own / np.maximum(mean, 1e-12), LITTLE)
         return out

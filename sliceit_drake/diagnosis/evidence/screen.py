@@ -408,8 +408,9 @@ def _evidence(
             out.size = left = size_by_record(beside_it, columns, fits)
         else:
             wrong = OwnError(problem, problem.with_causes([*statistics.taken, *active]), sizes)
-            out.size = standardised_size(problem, columns, value, wrong)
-            left = standardised_size(problem, columns, value, wrong, found=True)
+            taken = statistics.taken
+            out.size = standardised_size(problem, columns, value, wrong, beside=taken)
+            left = standardised_size(problem, columns, value, wrong, found=True, beside=taken)
         out.share = left**2 / (1.0 + left**2)
     return out
 

@@ -17,6 +17,7 @@ from sliceit_drake.diagnosis.evidence.linear import (
     beside,
     fitted_covariance,
 )
+from sliceit_drake.diagnosis.evidence.scatter import scatter_of_replicates
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, screen
 from sliceit_drake.diagnosis.evidence.trends import Trend, trend_of_slices
 
@@ -66,8 +67,8 @@ class DecisionRule:
         unknown: Size of the simulation's own error over the noise in contact from which on records
             that no cause explains are called unknown.
         trend: The same of what goes with the number of the slice.
-        known: The least gain where the food's file knows what the simulation gets wrong, times the
-            largest gain that the cause had in the file's own records, in which nothing had changed.
+        scatter: Where the food's file knows what the simulation gets wrong, greatest chance of a
+            cause's gain by how slices scatter that are cut alike.
         most: Greatest number of findings.
     """
 
@@ -81,7 +82,7 @@ class DecisionRule:
     presence: float = 0.4
     unknown: float = 1.0
     trend: float = 0.4
-    known: float = 3.0
+    scatter: float = 0.002
     most: int = 3
 
     def least_size(self, e: CauseEvidence) -> float:
@@ -323,9 +324,6 @@ def _refusal(
     problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule
 ) -> str:
     """Why a cause is not named; "" for one that may be."""
-    unchanged = rule.known * problem.found.known_chance.get(e.name, 0.0)
-    if not e.per_record and 0.0 < e.gain < unchanged:
-        return f"gains {e.gain:.0f}, where slices of the calibration may give {unchanged:.0f}"
     by_chance = (1.0 + (screening.largest >= e.deviations).sum()) / (len(screening.largest) + 1.0)
     if e.score <= 0.0 or by_chance > rule.alarm:
         return "gains no more than chance gives"
@@ -342,6 +340,12 @@ def _refusal(
     if _at_bound(e):
         return _at_bound(e)
     before = [*screening.assumed]
+    if problem.found.known_from and not e.per_record:
+        scatter = scatter_of_replicates(problem, e, before)
+        numbers = max(int(np.count_nonzero(e.coefficients)), 1)
+        if scatter.chance(e.gain, numbers) > rule.scatter:
+            times = f"{scatter.factor:.1f} times as much as their model says"
+            return f"gains {e.gain:.0f}, where slices that are cut alike scatter {times}"
     # A law cannot be wrong in the air.
     inside = 1.0 if e.per_record else _share_in_contact(problem, e)
     wrong = OwnError.beside(problem, [*before, e.cause])
@@ -460,7 +464,7 @@ def _lasting(
         if e.per_record:
             size = finding.size
         else:
-            size = standardised_size(problem, own, np.array(e.coefficients), wrong)
+            size = standardised_size(problem, own, np.array(e.coefficients), wrong, beside=others)
         if 2.0 * (high - low) <= e.limit or size < rule.least_size(e):
             left.remove(finding)
     return left
