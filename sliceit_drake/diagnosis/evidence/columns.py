@@ -6,7 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-__all__ = ["MESH", "CauseAtScan", "Column", "RecordSensitivity", "Sensitivities", "replicates"]
+__all__ = [
+    "MESH",
+    "STEP",
+    "CauseAtScan",
+    "Column",
+    "RecordSensitivity",
+    "Sensitivities",
+    "replicates",
+]
 
 NEAR = 3e-3
 """Height over the food below which a knife may touch: slices differ in height, metres."""
@@ -53,7 +61,7 @@ class Column:
         return f"{self.name}.{self.parameter}{scan}" if self.parameter else self.name
 
 
-MESH = Column("numerical", "mesh")
+STEP, MESH = Column("numerical", "step"), Column("numerical", "mesh")
 
 
 @dc.dataclass

@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 
 from sliceit_drake.diagnosis.evidence.columns import (
     MESH,
+    STEP,
     RecordSensitivity,
     Sensitivities,
     replicates,
@@ -161,9 +162,10 @@ class LinearProblem:
         self.base = found.index("base")
         self.own = found.index("record")
         # What step and mesh change is of the error that is known.
-        known = found.known_from > 0
-        self.numerical = [] if known else found.index("numerical")
-        self.mesh = None if known else next(iter(found.index("numerical", MESH.name)), None)
+        gone = {STEP.name, MESH.name} if found.known_from else set()
+        self.numerical = [k for k in found.index("numerical") if found.columns[k].name not in gone]
+        of_mesh = set(found.index("numerical", MESH.name))
+        self.mesh = next((k for k in self.numerical if k in of_mesh), None)
         self.conditions = replicates(found.records)
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]

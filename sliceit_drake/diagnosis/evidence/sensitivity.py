@@ -27,7 +27,13 @@ from sliceit_drake.content_store import ContentStore, content_key, source_key
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import (
+    MESH,
+    STEP,
+    Column,
+    RecordSensitivity,
+    Sensitivities,
+)
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget
 from sliceit_drake.prediction.simulator import Workers
@@ -87,8 +93,8 @@ def _model_changes(predictor: SlicePredictor, point: Point) -> list[_Change]:
                 own[effect.name] = own.get(effect.name, 0.0) + change
             moved.append(dc.replace(point, records=records))
         out.append(_Change(column, tuple(moved)))
-    for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
-        out.append(_Change(Column("numerical", name), (dc.replace(point, meshing=finer),), -1.0))
+    for column, finer in zip((STEP, MESH), predictor.meshings[1:], strict=False):
+        out.append(_Change(column, (dc.replace(point, meshing=finer),), -1.0))
     return out
 
 
