@@ -13,6 +13,7 @@ from test_diagnosis import problem
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
+from sliceit_drake.diagnosis.diagnose import _with_known
 from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
@@ -59,6 +60,15 @@ def test_what_is_known_goes_along_the_way_and_is_of_cuts_of_one_kind():
     found = Sensitivities(problem(1).found.columns, [r])
     assert with_known_error(found, known(1.3 * own_speed(r))) is None
     assert not known_of(known(own_speed(r)), dc.replace(r, channels=("force_x",))).any()
+
+
+def test_what_is_known_on_one_mesh_is_not_put_to_another():
+    found = Sensitivities(problem(1).found.columns, [record()])
+    given = dc.replace(known(own_speed(record())), refinement=0.75)
+    used, remarks = _with_known(found, given, [], 0.75)
+    assert used.known_from == 6 and not remarks
+    same, (remark,) = _with_known(found, given, [], 1.0)
+    assert same is found and "a mesh of refinement 0.75, and this is 1" in remark
 
 
 def test_what_is_known_is_no_own_error_and_stays_where_slices_are_predicted_anew():

@@ -293,12 +293,12 @@ def _learn_known_error(records: "Sequence[SliceRecord]", options: argparse.Names
     file = options.output / "food.yaml"
     food = load_calibrated_food(file)
     try:
-        with StageBars() as bars:
+        with StageBars("what it gets wrong: ") as bars:
             food.known_error = learn_known_error(
                 setup_of_food(food, DIAGNOSIS_REFINEMENT),
                 records,
                 workers=options.workers,
-                progress=lambda done, all: bars.show("what it gets wrong", done, all),
+                progress=bars.show,
             )
     except (ConfigurationError, CuttingError) as error:
         print(f"What the simulation gets wrong is not in food.yaml: {error}")

@@ -1,10 +1,10 @@
 """Record slices on a bench that stands in for a real one, on prescribed knife motions.
 
 PROTOCOL lists what is cut: food, knife, board, sensor, and conditions with their motions and
-replicates. Shipped are (calibration/protocols)
-  poor.yaml   one speed, push only, 6 slices
-  rich.yaml   three speeds, holds, withdrawals, second passes, draws, air: 18 slices
-  full.yaml   rich, and the bare board, a known weight, peeled and narrow food: 30 slices
+replicates. Shipped are, in calibration/protocols,
+  poor   one speed, push only, 6 slices
+  rich   three speeds, holds, withdrawals, second passes, draws, air: 18 slices
+  full   rich, and the bare board, a known weight, peeled and narrow food: 30 slices
 A scenario as `sliceit simulate` takes it will do: its food, knife, board and motion, cut
 --replicates times.
 
@@ -21,7 +21,7 @@ class of your own: `sliceit_drake.stand_in.effect` shows one. --list-effects sho
 
 Examples
   sliceit record --output records/null --seed 1
-  sliceit record calibration/protocols/full.yaml --effect arm_compliance:5e-5 --output records/a
+  sliceit record full --effect arm_compliance:5e-5 --output records/a
   sliceit record scenarios/cucumber_measured.yaml --replicates 6 --world curves --output records/b
   sliceit record --output records/c --seed 1 --backend dask --scheduler tcp://192.168.0.5:8786
 The workers of a cluster need no shared disk, but a FILE.py of yours at its place on each of them.

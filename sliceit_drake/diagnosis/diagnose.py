@@ -110,7 +110,7 @@ def diagnose(
     )
     remarks += found.warnings
     if known is not None:
-        found, why = _with_known(found, known, records)
+        found, why = _with_known(found, known, records, setup.refinement)
         remarks += why
     predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
     problem = at_own_values(
@@ -156,11 +156,13 @@ def diagnose(
 
 
 def _with_known(
-    found: Sensitivities, known: KnownError, records: Sequence[SliceRecord]
+    found: Sensitivities, known: KnownError, records: Sequence[SliceRecord], refinement: float
 ) -> tuple[Sensitivities, list[str]]:
     """Sensitivities with what the food's file knows, or as they were with the reason."""
     if {*map(record_key, records)} & {*known.records}:
         why = "it was learnt from records that are among these, which cannot tell what has changed"
+    elif refinement != known.refinement:
+        why = f"it is of a mesh of refinement {known.refinement:g}, and this is {refinement:g}"
     elif (more := with_known_error(found, known)) is not None:
         return more, []
     else:

@@ -6,7 +6,7 @@ ask what has changed since.
 """
 
 import dataclasses as dc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitiv
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
-from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
@@ -56,7 +56,7 @@ def learn_known_error(
     records: Sequence[SliceRecord],
     cache: Path | None = None,
     workers: Workers = None,
-    progress: Progress | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> KnownError:
     """What simulations of a calibrated food get wrong in records: the mean over each kind of cut,
     once what its slices differ in as a whole (toughness, modulus, friction, height) is taken off.
@@ -70,15 +70,26 @@ def learn_known_error(
         ConfigurationError: The records do not carry a diagnosis, naming file and field.
         CuttingError: The prediction itself broke down.
     """
+    show = progress or (lambda *_: None)
     check_records(records, setup.food)
     keys = [record_key(r) for r in records]
     records = without_lone_torques(records)
     every_sensor = {name for name, _ in USUAL}
     causes = [c for c in open_causes([p.name for p in setup.parameters]) if c.name in every_sensor]
-    found = sensitivities(setup, records, causes, cache=cache, workers=workers, progress=progress)
+    found = sensitivities(
+        setup,
+        records,
+        causes,
+        cache=cache,
+        workers=workers,
+        progress=lambda done, total: show("simulations", done, total),
+    )
     predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
-    whole = LinearProblem(found, may_be_uneven=True)
-    problem = at_own_values(whole, predictor, progress)
+    problem = at_own_values(
+        LinearProblem(found, may_be_uneven=True),
+        predictor,
+        lambda done, total: show("own values", done, total),
+    )
     own = own_coefficients(problem)
     own -= own.mean(0)
     rests = [
@@ -86,7 +97,7 @@ def learn_known_error(
         for r, a in zip(problem.found.records, own, strict=True)
     ]
     known = _mean(problem, rests)
-    known.records = keys
+    known.records, known.refinement = keys, setup.refinement
     return known
 
 

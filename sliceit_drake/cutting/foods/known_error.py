@@ -40,6 +40,8 @@ class KnownError:
     step: float = quantity(5e-4, "m", low=1e-5, high=0.01)
     """Of the way between the values, which begin this far before the first contact; see
     `diagnosis.known_error.way_of`."""
+    refinement: float = quantity(1.0, "", low=0.01, high=100.0)
+    """Of the mesh that it was simulated on: what is wrong on another is not known."""
     cuts: list[KnownErrorOfCut] = dc.field(default_factory=list)
     slices: int = 1
     records: list[str] = dc.field(default_factory=list)

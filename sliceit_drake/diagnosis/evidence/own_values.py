@@ -45,12 +45,12 @@ def at_own_values(
     added = [Column("numerical", f"mean_{found.columns[k].name}") for k in own]
     sizes = {found.columns[k].name: found.columns[k].size for k in own}
     again = problem
-    for _ in range(1 if predictor is None else PASSES):
+    for done in range(1 if predictor is None else PASSES):
         values = own_coefficients(again)
         values -= values.mean(0)
         changes: list[np.ndarray | None] = [None] * len(values)
         if predictor is not None:
-            changes = _simulated(predictor, sizes, values, progress)
+            changes = _simulated(predictor, sizes, values, _of_all(progress, done))
         records = [
             _moved(record, own, b, change)
             for record, b, change in zip(found.records, values, changes, strict=True)
@@ -58,6 +58,13 @@ def at_own_values(
         here = dc.replace(found, columns=[*found.columns, *added], records=records)
         again = LinearProblem(here, may_be_uneven=problem.may_be_uneven)
     return again
+
+
+def _of_all(progress: Progress | None, before: int) -> Progress | None:
+    """Progress over all `PASSES`, after some."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(before * total + done, PASSES * total)
 
 
 def _simulated(
