@@ -22,6 +22,7 @@ from studies.benches.draw import LAWS, RESERVED, Draw, seed_of
 from studies.benches.effects import BENCH_CAUSES, DEPTH_CAUSES, HIDDEN, CrossTalk, HiddenEffect
 from studies.benches.law_world import Cut, Heading, Law
 from studies.benches.noise import FAMILIES, Noise, unit_noise
+from studies.benches.report import in_words, newest_rates, runs_by_rule
 from studies.benches.runs import add_arguments, cases_of, commit_of, diagnosed
 from studies.benches.runs import run as run_benches
 from studies.benches.score import add_arguments as add_score_arguments
@@ -474,19 +475,9 @@ def test_the_table_has_rows_for_naming_nothing_the_top_and_the_oracle(tmp_path, 
     assert found["affected", "diagnosis"][-1].startswith("100 %")
 
 
-def in_words(said: dict) -> str:
-    """A diagnosis as the page of benches has it."""
-    if "failure" in said:
-        return "no answer"
-    found = [finding["cause"] for finding in said["findings"]]
-    if found:
-        return ", ".join(found)
-    return f"{said['verdict']}; {said['evidence'][0]['cause']} stands first"
-
-
 def test_the_page_has_each_reported_run():
     page = (ROOT / "docs/results/benches.md").read_text(encoding="utf-8")
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    rows = cells(page)
     reports = (ROOT / "docs/results/benches_report.jsonl").read_text(encoding="utf-8")
     answered = [report for report in map(json.loads, reports.splitlines()) if "earlier" in report]
     wanted = [
@@ -498,6 +489,45 @@ def test_the_page_has_each_reported_run():
     assert sorted(shown) == sorted(wanted)
     runs = (ROOT / "docs/results/benches_runs.jsonl").read_text(encoding="utf-8")
     assert all(run["commit"][:7] in page for run in map(json.loads, runs.splitlines()))
+
+
+def test_the_page_counts_the_newest_rule_and_marks_sizes_that_have_no_meaning():
+    def said(*causes: str) -> dict:
+        first = [{"cause": "sensor_gain"}]
+        facts = {"verdict": "cause" if causes else "nothing", "evidence": first, "causes": []}
+        found = [{"cause": c, "others": [], "values": {}} for c in causes]
+        return facts | {"classes": [[c] for c in causes], "findings": found, "gain": None}
+
+    def report(commit: str, law: str, size: float, *causes: str) -> dict:
+        case = {"law": law, "draw": 0, "effect": "cross_talk"}
+        facts = {"case": case, "commit": commit, "hidden": TILT | {"size": size}}
+        return facts | {"earlier": said(*causes), "affected": said()}
+
+    reports = [
+        report("1" * 40, "strips", 0.9, "sensor_gain"),
+        report("2" * 40, "bonds", 0.1, "sensor_tilt"),
+        report("2" * 40, "bonds", 0.1),
+    ]
+    rates_of = {tuple(row[:3]): row for row in cells(newest_rates(reports))}
+    assert rates_of["bonds", "earlier", "diagnosis"][3:6] == ["1", "1 of 2", "0 of 2"]
+    assert rates_of["all", "earlier", "always the top"][4:6] == ["0 of 2", "2 of 2"]
+    assert rates_of["all", "affected", "oracle"][4] == "2 of 2"
+    assert not any(row[0] == "strips" for row in cells(newest_rates(reports)))
+    rules = runs_by_rule(reports)
+    assert rules.index("2222222") < rules.index("1111111")
+    assert [
+        "strips",
+        "cross_talk",
+        "2.0 *",
+        "sensor_gain",
+        "nothing; sensor_gain stands first",
+    ] in (cells(rules))
+
+
+def cells(text: str) -> list[list[str]]:
+    """Of the tables in a text."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
 
 
 def test_a_diagnosis_that_breaks_down_is_kept_as_a_failure(tmp_path):

@@ -17,6 +17,9 @@ from sliceit_drake.diagnosis.diagnose import _with_known
 from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.own_values import centred_own
+from sliceit_drake.diagnosis.evidence.screen import screen
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule
 from sliceit_drake.diagnosis.known_error import (
     RESTING,
     known_of,
@@ -164,3 +167,25 @@ def test_slices_are_uneven_where_they_are_cut_and_not_on_the_bare_board():
     z = np.count_nonzero(problem_of_both.uneven)
     assert not problem_of_both._own_variance(model, len(both.records) - 1)[-z:].any()
     assert problem_of_both._own_variance(model, 0)[-z:].all()
+
+
+def test_slices_differ_about_the_mean_of_their_condition_where_an_error_is_known_or_learnt():
+    found = problem(7, replicates=4).found
+    toughness = found.index("record")
+    # What the simulation gets wrong of one condition is no property of its slices.
+    records = [
+        dc.replace(r, measured=r.measured + 3.0 * k * r.columns[:, :, toughness[0]])
+        for k, r in zip([0] * 4 + [1] * 4 + [2] * 4, found.records, strict=True)
+    ]
+    shifted = Sensitivities(found.columns, records)
+    plain, learnt = LinearProblem(shifted), LinearProblem(shifted, may_be_uneven=True)
+    assert np.abs(centred_own(plain).mean(0)).max() < 1e-9
+    assert np.ptp([centred_own(plain)[m].mean() for m in plain.conditions.values()]) > 2.0
+    for members in learnt.conditions.values():
+        assert np.abs(centred_own(learnt)[members].mean(0)).max() < 1e-9
+
+
+def test_less_is_asked_of_an_effect_where_what_looks_like_it_is_known():
+    rule, e = DecisionRule(), screen(slices(11, 1.0), 20).evidence("skin")
+    assert rule.least_size(slices(11, 1.0), e) == rule.size
+    assert rule.least_size(slices(11, 1.0, known_from=12), e) == rule.size_known < rule.size

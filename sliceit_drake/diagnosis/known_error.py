@@ -15,9 +15,8 @@ from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.content_store import content_key
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
-from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
-from sliceit_drake.diagnosis.evidence.own_values import at_own_values
+from sliceit_drake.diagnosis.evidence.own_values import at_own_values, centred_own
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
@@ -59,7 +58,8 @@ def learn_known_error(
     progress: Callable[[str, int, int], None] | None = None,
 ) -> KnownError:
     """What simulations of a calibrated food get wrong in records: the mean over each kind of cut,
-    once what its slices differ in as a whole (toughness, modulus, friction, height) is taken off.
+    once what slices of that kind differ in as a whole (toughness, modulus, friction, height) is
+    taken off.
 
     Args:
         setup: Of the food at its calibrated values.
@@ -90,8 +90,7 @@ def learn_known_error(
         predictor,
         lambda done, total: show("own values", done, total),
     )
-    own = own_coefficients(problem)
-    own -= own.mean(0)
+    own = centred_own(problem)
     rests = [
         r.residual - r.columns[:, :, problem.own] @ a
         for r, a in zip(problem.found.records, own, strict=True)

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from studies.benches import report as bench_report
 from studies.calibration import coverage
 from studies.hidden_effects.archive import unpack
 from studies.hidden_effects.report import report
@@ -82,6 +83,9 @@ def _places(docs: Path) -> Iterator[tuple[str, str, str]]:
     )
     results = docs / "results"
     evaluation, faster = results / "slicing_evaluation.jsonl", results / "faster_draws.jsonl"
+    reports = bench_report.reported(results / "benches_report.jsonl")
+    yield "bench_rates", "results/benches.md", bench_report.newest_rates(reports)
+    yield "bench_runs", "results/benches.md", bench_report.runs_by_rule(reports)
     table = faster_draws.draws_table(evaluation, faster, command)
     yield "faster_draws", "results/learning.md", "\n".join(table)
 

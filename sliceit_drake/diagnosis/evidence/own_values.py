@@ -16,7 +16,7 @@ from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
 from sliceit_drake.diagnosis.prediction import Point, SlicePredictor, changes_at
 
-__all__ = ["at_own_values"]
+__all__ = ["at_own_values", "centred_own"]
 
 PASSES = 2
 """Times that own values are found, each where the records were simulated the time before."""
@@ -30,8 +30,9 @@ def at_own_values(
     """A problem with the columns of each record's own at their values.
 
     A change c b + e b^2 is linearised at the b that fits the record best, less the mean over all
-    records, which may be another cause's doing. For what e does where that mean is the slices' own,
-    there is a numerical column of each. Beyond the step of the derivative e b^2 goes on in a
+    records, which may be another cause's doing; where an error is known or learnt, less the mean of
+    the record's condition, which is part of that. For what e does where that mean is the slices'
+    own, there is a numerical column of each. Beyond the step of the derivative e b^2 goes on in a
     straight line, as it does past a sharp bend.
 
     Args:
@@ -46,8 +47,7 @@ def at_own_values(
     sizes = {found.columns[k].name: found.columns[k].size for k in own}
     again = problem
     for done in range(1 if predictor is None else PASSES):
-        values = own_coefficients(again)
-        values -= values.mean(0)
+        values = centred_own(again)
         changes: list[np.ndarray | None] = [None] * len(values)
         if predictor is not None:
             changes = _simulated(predictor, sizes, values, _of_all(progress, done))
@@ -58,6 +58,16 @@ def at_own_values(
         here = dc.replace(found, columns=[*found.columns, *added], records=records)
         again = LinearProblem(here, may_be_uneven=problem.may_be_uneven)
     return again
+
+
+def centred_own(problem: LinearProblem) -> np.ndarray:
+    """Coefficients of what is each record's own [R, n], less their mean: over all records, or where
+    an error is known or learnt over the record's condition."""
+    values = own_coefficients(problem)
+    groups = problem.conditions.values() if problem.may_be_uneven else [range(len(values))]
+    for members in map(list, groups):
+        values[members] -= values[members].mean(0)
+    return values
 
 
 def _of_all(progress: Progress | None, before: int) -> Progress | None:

@@ -61,6 +61,7 @@ class DecisionRule:
             causes of up to this size.
         size_by_record: The same of an effect that differs from record to record, over the noise
             alone: no own error does that.
+        size_known: The same where the food's file knows what the simulation gets wrong.
         limit: Level of the intervals of the causes' numbers.
         replicates: Slices of a condition from which variation can be told from an effect.
         presence: Share of the records in which a cause shows that has numbers of its own in each.
@@ -77,6 +78,7 @@ class DecisionRule:
     beside: float = 3.0
     size: float = 0.9
     size_by_record: float = 0.5
+    size_known: float = 0.7
     limit: float = 0.1
     replicates: int = 3
     presence: float = 0.4
@@ -85,9 +87,10 @@ class DecisionRule:
     scatter: float = 0.002
     most: int = 3
 
-    def least_size(self, e: CauseEvidence) -> float:
+    def least_size(self, problem: LinearProblem, e: CauseEvidence) -> float:
         """Of a cause that is named."""
-        return self.size_by_record if e.per_record else self.size
+        shared = self.size_known if problem.found.known_from else self.size
+        return self.size_by_record if e.per_record else shared
 
 
 @dc.dataclass
@@ -331,9 +334,11 @@ def _refusal(
         # What the simulation may be wrong by is of the group itself: it is not what this is beside.
         own = problem.found.of_causes([e.cause])
         size = standardised_size(problem, own, np.array(e.coefficients))
-        if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
+        if size >= rule.least_size(problem, e) and e.gain >= max(
+            other.gain for other in screening.causes
+        ):
             return _at_bound(e)
-    if e.size < rule.least_size(e):
+    if e.size < rule.least_size(problem, e):
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
         return f"shows in {100 * e.presence:.0f} % of the records that could show it"
@@ -465,7 +470,7 @@ def _lasting(
             size = finding.size
         else:
             size = standardised_size(problem, own, np.array(e.coefficients), wrong, beside=others)
-        if 2.0 * (high - low) <= e.limit or size < rule.least_size(e):
+        if 2.0 * (high - low) <= e.limit or size < rule.least_size(problem, e):
             left.remove(finding)
     return left
 
