@@ -475,6 +475,19 @@ def test_the_table_has_rows_for_naming_nothing_the_top_and_the_oracle(tmp_path, 
     assert found["affected", "diagnosis"][-1].startswith("100 %")
 
 
+def test_kept_runs_stay_where_those_of_another_rule_are_added(tmp_path):
+    parser = argparse.ArgumentParser()
+    add_score_arguments(parser)
+    file = tmp_path / "kept.jsonl"
+    for commit, law in (("1" * 40, "bonds"), ("2" * 40, "bonds"), ("2" * 40, "bonds")):
+        facts = {"case": {"law": law, "draw": 0, "number": 0}, "commit": commit, "part": "training"}
+        said = {"verdict": "nothing", "classes": [], "evidence": [], "gain": None}
+        facts |= {"hidden": hidden("", 0.0), "earlier": said, "affected": said}
+        write_json(tmp_path / "runs" / "run.json", facts)
+        assert run_score(parser.parse_args([str(tmp_path), "--keep", str(file)])) == 0
+    assert [facts["commit"][0] for facts in answers_of(file)] == ["1", "2"]
+
+
 def test_the_page_has_each_reported_run():
     page = (ROOT / "docs/results/benches.md").read_text(encoding="utf-8")
     rows = cells(page)

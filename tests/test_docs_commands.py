@@ -282,12 +282,7 @@ READ_ONLY = {
         python -m studies disect --output docs/results
         python -m studies bench_misfit --draws 2 --output output/misfit.md
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 5
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 12 --minutes 6
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 2 --minutes 16
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --laws LAW --draws 12 --runs 2 --minutes 17
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 3
-        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 2 --minutes 34
+        python -m studies benches --part reporting --frozen COMMIT --commit COMMIT --output FOLDER --draws 12 --runs 6 --minutes 29
         python -m studies bench_score FOLDER --keep docs/results/benches_report.jsonl
         python -m studies bench_score docs/results/benches_report.jsonl
         python -m studies half_depth --output docs/figures/half_depth.png

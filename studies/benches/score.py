@@ -10,7 +10,7 @@ Values are judged where a cause was named rightly whose parameter the hidden eff
 delay, a mass). The gain is the share of the removable error on left-out records that what
 was named removes, over the share that the right cause would, as this diagnosis fits it.
 
---keep writes what a judgement needs of each run as a line of JSON. This file is judged like the
+--keep adds what a judgement needs of each run to a file, as a line of JSON. It is judged like the
 folder, and `benches --kept FILE` goes on from it.
 
   python -m studies bench_score output/benches --output docs/results/benches_table.md
@@ -262,7 +262,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="--output of `benches`, or what --keep wrote",
     )
-    parser.add_argument("--keep", metavar="FILE", type=Path, help="write all runs, a line for each")
+    parser.add_argument(
+        "--keep", metavar="FILE", type=Path, help="add all runs to it, a line for each"
+    )
     parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
 
 
@@ -270,7 +272,9 @@ def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     answers = [facts for source in options.runs for facts in answers_of(source)]
     if options.keep:
-        lines = (json.dumps(kept(facts), sort_keys=True) + "\n" for facts in answers)
+        before = answers_of(options.keep) if options.keep.exists() else []
+        runs = {_key(facts): facts for facts in (*before, *map(kept, answers))}
+        lines = (json.dumps(facts, sort_keys=True) + "\n" for facts in runs.values())
         options.keep.write_text("".join(lines), encoding="utf-8")
     rng, rows = np.random.default_rng(0), []
     for law in LAWS:
@@ -290,6 +294,11 @@ def run(options: argparse.Namespace) -> int:
     head = " | ".join(["law", "food calibrated to", "who", "draws", *COLUMNS])
     publish(table(head, rows), options.output)
     return 0
+
+
+def _key(facts: Mapping[str, Any]) -> tuple[str, str, str, int, int]:
+    case = facts["case"]
+    return facts["commit"], facts["part"], case["law"], case["draw"], case["number"]
 
 
 def _cell(share: float, low: float, high: float, runs: int) -> str:
