@@ -12,6 +12,7 @@ from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.scatter import Scatter, scatter_of_replicates
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, screen
+from sliceit_drake.diagnosis.evidence.verdict import reach_verdict
 
 TWO_SIDED = [dc.replace(c, one_sided=False) for c in COLUMNS]
 
@@ -67,5 +68,9 @@ def test_the_chance_is_that_of_an_f_distribution_where_slices_scatter_much():
 def test_replicates_that_agree_more_than_they_should_are_little_evidence_and_without_any_is_none():
     agreeing = [Scatter(factor, 6.0).chance(30.0, 1) for factor in (0.01, 0.3, 1.0, 3.0)]
     assert chi2.sf(30.0, 1) < agreeing[0] < agreeing[1] < agreeing[2] < agreeing[3]
-    e, alone = seen(problem(1, 1, skin=3.0))
+    single = problem(1, 1, skin=8.0)
+    e, alone = seen(single)
     assert alone.freedom == 0.0 and alone.chance(e.gain, 1) == 1.0
+    known = LinearProblem(dc.replace(single.found, known_from=3))
+    why = {cause.name: cause.why for cause in reach_verdict(known, 60).causes}
+    assert "no slices are cut alike" in why["skin"]

@@ -348,6 +348,8 @@ def _refusal(
     if problem.found.known_from and not e.per_record:
         scatter = scatter_of_replicates(problem, e, before)
         numbers = max(int(np.count_nonzero(e.coefficients)), 1)
+        if scatter.freedom == 0.0:
+            return "no slices are cut alike, which would show how they scatter"
         if scatter.chance(e.gain, numbers) > rule.scatter:
             times = f"{scatter.factor:.1f} times as much as their model says"
             return f"gains {e.gain:.0f}, where slices that are cut alike scatter {times}"
