@@ -231,7 +231,9 @@ def test_a_skin_of_the_setup_that_a_coarse_mesh_cannot_show_is_taken_on_the_setu
     assert choice.taken == ["skin"]
     assert choice.setup.food.effects.skin.thickness > 0.0
     assert choice.values["effects.skin.toughness"] > 0.0
-    assert any("The setup's own food, with skin: taken instead" in line for line in choice.lines)
+    # By the last bits of a machine's single precision the coarse mesh may just show it as well.
+    ways = ("The setup's own food, with skin: taken instead", "skin: taken")
+    assert any(line.startswith(ways) for line in choice.lines)
 
 
 def test_a_setup_has_the_elements_that_it_varies_or_has_switched_on():
