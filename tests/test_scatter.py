@@ -12,7 +12,7 @@ from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.scatter import Scatter, scatter_of_replicates
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, screen
-from sliceit_drake.diagnosis.evidence.verdict import reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
 
 TWO_SIDED = [dc.replace(c, one_sided=False) for c in COLUMNS]
 
@@ -63,6 +63,19 @@ def test_the_chance_is_that_of_an_f_distribution_where_slices_scatter_much():
         assert Scatter(factor, freedom).chance(16.0 * factor, 2) == pytest.approx(by_f, rel=0.05)
     # With the variance known, by chi squared.
     assert Scatter(1.0, 1e3).chance(9.0, 2) == pytest.approx(chi2.sf(9.0, 2), rel=0.3)
+
+
+def test_what_slices_feign_is_not_named_where_an_error_is_known():
+    """Each slice has a skin of its own; in the last case all have one."""
+    some = [slices(seed, 2.0) for seed in range(6)]
+    some = [LinearProblem(dc.replace(p.found, known_from=9)) for p in some]
+    lax = DecisionRule(scatter=1.0)
+    feigned = [reach_verdict(p, 60, rule=lax).names for p in some]
+    assert sum(any("skin" in group for group in names) for names in feigned) >= 2
+    for p in some:
+        assert not any("skin" in group for group in reach_verdict(p, 60).names)
+    real = LinearProblem(dc.replace(slices(1, 0.2, 8.0).found, known_from=9))
+    assert any("skin" in group for group in reach_verdict(real, 60).names)
 
 
 def test_replicates_that_agree_more_than_they_should_are_little_evidence_and_without_any_is_none():

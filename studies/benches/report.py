@@ -1,20 +1,16 @@
 """The parts of docs/results/benches.md that follow from the reported runs alone."""
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from studies.benches.draw import LAWS
 from studies.benches.effects import HIDDEN
 from studies.benches.runs import CALIBRATED_TO
-from studies.benches.score import COLUMNS, Judged, judge, measured, named_by
+from studies.benches.score import COLUMNS, Judged, judge, named_by
 from studies.hidden_effects.score import NAMING
 from studies.pages import table
 
-__all__ = ["in_words", "newest_rates", "reported", "runs_by_rule"]
+__all__ = ["in_words", "newest_rates", "runs_by_rule"]
 
 SHOWN = (
     "named rightly",
@@ -31,11 +27,6 @@ WHO = ("diagnosis", "always the top", "oracle")
 Reports = Sequence[Mapping[str, Any]]
 
 
-def reported(file: Path) -> list[dict[str, Any]]:
-    """Runs that `bench_score --keep` wrote, in the order of their reports."""
-    return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-
-
 def in_words(said: Mapping[str, Any]) -> str:
     """A diagnosis in a cell: what it names, or its verdict and what stands first."""
     if "failure" in said:
@@ -46,7 +37,11 @@ def in_words(said: Mapping[str, Any]) -> str:
 
 
 def newest_rates(reports: Reports) -> str:
-    """Hits and runs of the newest rule, by law, calibration and who answers."""
+    """Hits and runs of the newest rule, by law, calibration and who answers.
+
+    Args:
+        reports: As `score.answers_of` reads what `bench_score --keep` wrote.
+    """
     newest = [f for f in reports if f["commit"] == reports[-1]["commit"] and f["hidden"]]
     laws = [law for law in LAWS if any(f["case"]["law"] == law for f in newest)]
     rows = []
@@ -54,21 +49,16 @@ def newest_rates(reports: Reports) -> str:
         for who in WHO:
             for law in [*laws, "all"] if who == "diagnosis" else ["all"]:
                 of_law = [f for f in newest if law in ("all", f["case"]["law"])]
-                judged = [_judged(who, f, to) for f in of_law]
+                judged = [judge(named_by(who, f, to), f["hidden"], to) for f in of_law]
                 draws = len({(f["case"]["law"], f["case"]["draw"]) for f in of_law})
                 rows.append((law, to, who, draws, *(_count(judged, title) for title in SHOWN)))
     head = " | ".join(["law", "food calibrated to", "who", "draws", *SHOWN])
     return table(head, rows, "   " + "r" * (1 + len(SHOWN)))
 
 
-def _judged(who: str, facts: Mapping[str, Any], to: str) -> Judged:
-    verdict = judge(named_by(who, facts, to), facts["hidden"], to)
-    return measured(verdict, facts[to], facts["hidden"]) if who == "diagnosis" else verdict
-
-
 def _count(judged: Sequence[Judged], title: str) -> str:
     marks = [mark for j in judged if (mark := COLUMNS[title](j)) is not None]
-    return f"{int(np.sum([bool(mark) for mark in marks]))} of {len(marks)}" if marks else ""
+    return f"{sum(map(bool, marks))} of {len(marks)}" if marks else ""
 
 
 def runs_by_rule(reports: Reports) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from studies.benches import report as bench_report
+from studies.benches.score import answers_of
 from studies.calibration import coverage
 from studies.hidden_effects.archive import unpack
 from studies.hidden_effects.report import report
@@ -83,7 +84,7 @@ def _places(docs: Path) -> Iterator[tuple[str, str, str]]:
     )
     results = docs / "results"
     evaluation, faster = results / "slicing_evaluation.jsonl", results / "faster_draws.jsonl"
-    reports = bench_report.reported(results / "benches_report.jsonl")
+    reports = answers_of(results / "benches_report.jsonl")
     yield "bench_rates", "results/benches.md", bench_report.newest_rates(reports)
     yield "bench_runs", "results/benches.md", bench_report.runs_by_rule(reports)
     table = faster_draws.draws_table(evaluation, faster, command)

@@ -164,8 +164,8 @@ class LinearProblem:
         # What step and mesh change is of the error that is known.
         gone = {STEP.name, MESH.name} if found.known_from else set()
         self.numerical = [k for k in found.index("numerical") if found.columns[k].name not in gone]
-        of_mesh = set(found.index("numerical", MESH.name))
-        self.mesh = next((k for k in self.numerical if k in of_mesh), None)
+        of_mesh = (k for k in self.numerical if found.columns[k].name == MESH.name)
+        self.mesh = next(of_mesh, None)
         self.conditions = replicates(found.records)
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]
