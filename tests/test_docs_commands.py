@@ -297,7 +297,8 @@ READ_ONLY = {
         python -m studies verification --output docs/results/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
-        python -m studies batch_speed --repeats 1 --output docs/results/speed.md
+        python -m studies batch_speed --repeats 1
+        python -m studies batch_speed --repeats 3 --gradient --output docs/results/speed.md
         python -m studies calibration_times --foods potato
         python -m studies calibration_times --foods tomato cucumber
         python -m studies contact --output docs/results/contact.md

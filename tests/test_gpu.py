@@ -85,10 +85,10 @@ def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, t
     assert main(["batch_speed", *options, "--output", str(page)]) == 0
     assert "The GPU is skipped: there is no CUDA device" in capsys.readouterr().out
     text = page.read_text(encoding="utf-8")
-    rows = [line.split("|")[1:5] for line in text.splitlines() if line.startswith("| cpu")]
+    rows = [line.split("|")[1:6] for line in text.splitlines() if line.startswith("| cpu")]
     assert [row[1].strip() for row in rows] == ["1", "2"]
     # The first cut of a batch is the same in all of them.
-    assert [row[3].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
+    assert [row[4].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
     assert text.startswith("before\n") and text.endswith("after\n")
     assert batch_speed.PLACE.put(
         (ROOT / "docs/results/speed.md").read_text(encoding="utf-8"), "", "speed.md"

@@ -7,7 +7,7 @@ import numpy as np
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver, DriverPool
-from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion
+from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion, sample_poses
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.simulate import SliceForces
 from sliceit_drake.cutting.solver import NOT_FINITE
@@ -86,7 +86,9 @@ def cut_together(
 ) -> list[BatchSlice]:
     """Simulates slices that advance side by side; their cuts are all derived from one model."""
     T = driver.exchange_period
-    paths = [KnifePath(m, x, T) for m, x in zip(models, motions, strict=True)]
+    # A motion of many cuts is sampled once.
+    poses = {id(motion): sample_poses(motion, T) for motion in {id(x): x for x in motions}.values()}
+    paths = [KnifePath(m, x, T, poses[id(x)]) for m, x in zip(models, motions, strict=True)]
     count = max(path.coupling_steps for path in paths)
     wrenches = np.full((len(models), count, 3, 6), np.nan)
     cut = np.full((len(models), count), np.nan)

@@ -13,7 +13,7 @@ import functools
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.sparse import coo_array, csc_array, csr_array, tril
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
@@ -89,13 +89,10 @@ class Inertia:
             raise ValueError("the mass matrix is not positive definite")
         lower = tril(lu.L, -1).tocsc()
         first = first_inverted(np.diff(lower.indptr))
-        last = solve_triangular(
-            lower[first:, first:].toarray(),
-            np.eye(len(pivot) - first),
-            lower=True,
-            unit_diagonal=True,
-        )
-        inverse = last.T @ (last / pivot[first:, None])
+        cholesky = lower[first:, first:].toarray()
+        np.fill_diagonal(cholesky, 1.0)
+        half, _ = dpotri(cholesky * np.sqrt(pivot[first:]), lower=True)
+        inverse = half + np.tril(half, -1).T
         inverse = np.pad(inverse, [(0, 0), (0, -len(inverse) % WIDTH)])
         lower.data[lower.indptr[first] :] = 0.0
         lower.eliminate_zeros()

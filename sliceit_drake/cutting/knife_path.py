@@ -10,7 +10,7 @@ from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 
-__all__ = ["CHECK_TRAVEL", "KnifePath", "Mounting", "PosedMotion"]
+__all__ = ["CHECK_TRAVEL", "KnifePath", "Mounting", "PosedMotion", "sample_poses"]
 
 CHECK_TRAVEL = 1e-3
 """Travel of the knife between two checks of the energies, metres."""
@@ -30,8 +30,25 @@ class PosedMotion(typing.Protocol):
     def pose(self, t: float) -> Pose: ...
 
 
+def sample_poses(motion: PosedMotion, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """R_FK [E + 1, 3, 3] and p_FK [E + 1, 3], metres, at the coupling steps of a motion.
+
+    Args:
+        period: Of a coupling step, s.
+    """
+    steps = max(1, round(motion.duration / period))
+    poses = [motion.pose(k * period) for k in range(steps + 1)]
+    return np.array([X_FK.R for X_FK in poses]), np.array([X_FK.p for X_FK in poses])
+
+
 class KnifePath:
     """Poses of the knife at the coupling steps, in F and relative to the food in C.
+
+    Args:
+        model: The cut.
+        motion: Of the knife.
+        period: Of a coupling step, s.
+        poses: What `sample_poses` gives for the motion, where it is known.
 
     Attributes:
         model: The cut.
@@ -41,13 +58,17 @@ class KnifePath:
         rigid: Whether it does not give.
     """
 
-    def __init__(self, model: CuttingModel, motion: PosedMotion, period: float) -> None:
+    def __init__(
+        self,
+        model: CuttingModel,
+        motion: PosedMotion,
+        period: float,
+        poses: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         self._period = period
-        self.coupling_steps = max(1, round(motion.duration / period))
-        poses = [motion.pose(k * period) for k in range(self.coupling_steps + 1)]
-        self.R_FK = np.array([X_FK.R for X_FK in poses])
-        self.p_FK = np.array([X_FK.p for X_FK in poses])
-        self._commands = self.p_FK.copy()
+        self.R_FK, self._commands = poses or sample_poses(motion, period)
+        self.p_FK = self._commands.copy()
+        self.coupling_steps = len(self.p_FK) - 1
         self.model = model
         self.R_CK = model.X_FC_rotation.T @ self.R_FK
         self.p_CK = model.to_cut_frame(self.p_FK)
