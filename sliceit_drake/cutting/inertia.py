@@ -25,6 +25,8 @@ COST_OF_ROW = 10.0
 """Of a row in substitutions, forwards and backwards, over that of an entry."""
 COST_OF_PRODUCT = 0.1
 """Of an entry of an inverse, over that of an entry in substitutions."""
+LANCZOS = 8
+"""Vectors of Lanczos's method: from a start near the motion, one round of them is enough."""
 
 
 @dc.dataclass(frozen=True)
@@ -162,21 +164,30 @@ def assemble(
     return matrix
 
 
-def largest_share(forces: Callable[[np.ndarray], np.ndarray], mass: csc_array) -> float:
+def largest_share(
+    forces: Callable[[np.ndarray], np.ndarray], mass: csc_array, start: np.ndarray
+) -> float:
     """Largest eigenvalue of linear, symmetric forces with respect to a mass matrix, to about 1 %.
 
     Args:
         forces: What gives them [K + 1, 3] for a motion of nodes and blade [K + 1, 3].
         mass: See `Inertia`.
+        start: A motion near the one that is looked for [K + 1, 3].
     """
     factors, n = _factorized(mass, "NATURAL"), 3 * mass.shape[0]
     stiffness, inertia, inverse = (
         LinearOperator((n, n), lambda v, f=f: f(v.reshape(-1, 3)).ravel(), dtype=np.float64)
         for f in (forces, mass.__matmul__, factors.solve)
     )
-    start = np.random.default_rng(0).normal(size=n)
     found = eigsh(
-        stiffness, 1, inertia, v0=start, tol=1e-2, Minv=inverse, return_eigenvectors=False
+        stiffness,
+        1,
+        inertia,
+        v0=start.ravel(),
+        ncv=LANCZOS,
+        tol=1e-2,
+        Minv=inverse,
+        return_eigenvectors=False,
     )
     return float(found[0])
 

@@ -148,7 +148,7 @@ class CuttingModel(CutGeometry):
     point_scales: PointScales
     true_mass: np.ndarray = dc.field(init=False)
     _inertia_of: "CuttingModel | None" = dc.field(init=False, default=None)
-    _longer: "CuttingModel | None" = dc.field(init=False, default=None)
+    _like: "CuttingModel | None" = dc.field(init=False, default=None)
     weight: np.ndarray = dc.field(init=False)
     toughness: np.ndarray = dc.field(init=False)
     toughness_by_scale: np.ndarray = dc.field(init=False)
@@ -339,67 +339,66 @@ class CuttingModel(CutGeometry):
         With f = -K u - C v a step is stable if S >= (x / 2)^2 K + (x / 2) C. Every stiffness that
         can become active is there from the start.
         """
-        material, numerics, parameters = self.material, self.numerics, self.parameters
-        mu, lam = material.lame()
-        x = numerics.time_step / numerics.stability_margin
-        square, half = 0.25 * x**2, 0.5 * x
+        bulk, bond, flank, anchor, unloading, board, blade = self._mass_parts
         _, products = self._gradient_products
-        damped = square * (1.0 + 2.0 * numerics.numerical_damping)
-        viscous = damped + half * material.damping_time
-        modulus = bulk_factor * (lam + 2.0 * mu) * self.element_volume
-        bulk = (viscous * modulus)[:, None, None] * products
-        area, adhesion = self.tables.area, self.effects.adhesion
-        scaled = damped * self.flank_scale * area
-        flank = parameters["flank_stiffness"] * scaled
-        # Friction acts against the knife's body. So does the part of the pressure that is not
-        # along y: the flanks lean a little, and so may the knife.
-        anchor = (parameters["anchor_stiffness"] + LEAN**2 * parameters["flank_stiffness"]) * scaled
-        anchor = anchor + x * adhesion.viscosity * adhesion.steepest * area
-        bond = square * parameters["bond_stiffness"] * area
         w, zero = self.point_weights, np.zeros_like(self.point_weights)
         none = zero[:, :1]
         minus, plus = np.hstack([w, zero, none]), np.hstack([zero, w, none])
-        blade = np.hstack([zero, zero, none + 1.0])
+        middle = np.hstack([zero, zero, none + 1.0])
         ends = np.column_stack([self.point_nodes, np.full(len(w), len(self.nodes))])
         points = sum(
             stiffness[:, None, None] * row[:, :, None] * row[:, None, :]
             for stiffness, row in (
                 (bond, plus - minus),
-                (flank, minus - blade),
-                (flank, plus - blade),
+                (flank, minus - middle),
+                (flank, plus - middle),
                 (anchor, minus),
                 (anchor, plus),
-                (square * self.unloading, 0.5 * (minus + plus)),
+                (unloading, 0.5 * (minus + plus)),
             )
         )
+        parts = [(self.tetrahedra, (bulk_factor * bulk)[:, None, None] * products), (ends, points)]
+        return self._with_blade(parts, self.true_mass + board, float(blade[0]))
+
+    @functools.cached_property
+    def _mass_parts(self) -> tuple[np.ndarray, ...]:
+        """What `_scaled_masses` adds to the true masses: factors of the bulk in each element [T];
+        of bonds, flanks, friction and unloading at each cut point [P]; the board's at each node
+        [N]; and the blade's entry [1], all kg but the first, kg m^2."""
+        material, numerics, parameters = self.material, self.numerics, self.parameters
+        mu, lam = material.lame()
+        x = numerics.time_step / numerics.stability_margin
+        square, half = 0.25 * x**2, 0.5 * x
+        damped = square * (1.0 + 2.0 * numerics.numerical_damping)
+        viscous = damped + half * material.damping_time
+        area, adhesion = self.tables.area, self.effects.adhesion
+        scaled = damped * self.flank_scale * area
+        # Friction acts against the knife's body. So does the part of the pressure that is not
+        # along y: the flanks lean a little, and so may the knife.
+        anchor = (parameters["anchor_stiffness"] + LEAN**2 * parameters["flank_stiffness"]) * scaled
         board = parameters["board_stiffness"] * self.board_area
-        board = board * (2.0 * square + half * numerics.board_damping_time)
-        parts = [(self.tetrahedra, bulk), (ends, points)]
-        entry = self.knife.lateral_mass() + self._bending(x)
-        return self._with_blade(parts, self.true_mass + board, entry)
+        return (
+            viscous * (lam + 2.0 * mu) * self.element_volume,
+            square * parameters["bond_stiffness"] * area,
+            parameters["flank_stiffness"] * scaled,
+            anchor + x * adhesion.viscosity * adhesion.steepest * area,
+            square * self.unloading,
+            board * (2.0 * square + half * numerics.board_damping_time),
+            np.array([self.knife.lateral_mass() + self._bending(x)]),
+        )
 
     @functools.cached_property
     def _bulk_share(self) -> float:
         """Share of the mass matrix that the stiffness and damping of the bulk need, at most.
 
         (lam + 2 mu) grad u : grad u bounds the bulk's energy where the surface is held; a part that
-        is free may dilate, by up to 3 lam + 2 mu. A shorter step has no larger share, but for
-        what `damping_time` needs beside the stiffness.
+        is free may dilate, by up to 3 lam + 2 mu.
         """
-        longer = self._longer
-        if longer is not None and longer.numerics.time_step > self.numerics.time_step:
-            most = longer._bulk_share * self._bulk_needs / longer._bulk_needs
-            if most <= BULK_SHARE:
-                return most
+        if self._like is not None and (most := self._share_by(self._like)) <= BULK_SHARE:
+            return most
         mu, lam = self.material.lame()
-        half = 0.5 * self.numerics.time_step
-        modulus = (half**2 + half * self.parameters["damping_time"]) * self.element_volume
-        g = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
-        rows = np.broadcast_to(np.arange(3 * len(g)).reshape(-1, 1, 3), g.shape)
-        columns = np.broadcast_to(self.tetrahedra[:, :, None], g.shape)
-        entries = g.ravel(), (rows.ravel(), columns.ravel())
-        gradient = csc_array(entries, (3 * len(g), len(self.nodes)))[:, self.moving].tocsr()
-        back = gradient.T.tocsr()
+        modulus = self._bulk_modulus
+        gradient, back = self._gradient
 
         def forces(motion: np.ndarray) -> np.ndarray:
             strain = (gradient @ motion[:-1]).reshape(-1, 3, 3)
@@ -408,12 +407,28 @@ class CuttingModel(CutGeometry):
             of_nodes = back @ (modulus[:, None, None] * stress).reshape(-1, 3)
             return np.vstack([of_nodes, np.zeros(3)])
 
-        return largest_share(forces, self._unraised_masses)
+        # A dilation needs most. Some of any other motion is in the start, in case one does.
+        around = self.nodes[self.moving] - self.nodes[self.moving].mean(0)
+        start = np.vstack([around, np.zeros(3)])
+        start += 0.1 * around.std() * np.random.default_rng(0).normal(size=start.shape)
+        return largest_share(forces, self._unraised_masses, start)
 
     @property
-    def _bulk_needs(self) -> float:
-        """Stiffness and damping of the bulk over its stiffness, in half a step."""
-        return 1.0 + 2.0 * self.parameters["damping_time"] / self.numerics.time_step
+    def _bulk_modulus(self) -> np.ndarray:
+        """What the moduli are multiplied with in each element [T], s^2 m^3: stiffness and damping
+        in half a step."""
+        half = 0.5 * self.numerics.time_step
+        return (half**2 + half * self.parameters["damping_time"]) * self.element_volume
+
+    def _share_by(self, other: "CuttingModel") -> float:
+        """A bound of `_bulk_share` by that of another cut of the mesh, whose masses and stiffness
+        are sums of the same positive parts with other factors."""
+        mine, theirs = ((m.true_mass, *m._mass_parts) for m in (self, other))
+        lightest = min(_ratios(a, b).min(initial=np.inf) for a, b in zip(mine, theirs, strict=True))
+        moduli = (np.array(m.material.lame()) for m in (self, other))
+        stiffest = _ratios(*moduli).max() * _ratios(self._bulk_modulus, other._bulk_modulus).max()
+        with np.errstate(divide="ignore"):
+            return float(other._bulk_share * stiffest / lightest)
 
     def _stiffness_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Gershgorin's bounds of a quarter of the stiffness, N/m, and of half the damping, Ns/m, of
@@ -569,7 +584,14 @@ class CuttingModel(CutGeometry):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy, also in another process, may get other values, and then has other inertia.
-        own = ("inertia", "critical_time_step", "_unraised_masses", "_bulk_share", "_longer")
+        own = (
+            "inertia",
+            "critical_time_step",
+            "_unraised_masses",
+            "_mass_parts",
+            "_bulk_share",
+            "_like",
+        )
         return {k: v for k, v in vars(self).items() if k not in own} | {"_by_step": {}}
 
     def with_step(self, step: float) -> Self:
@@ -580,7 +602,7 @@ class CuttingModel(CutGeometry):
         if name not in self._by_step:
             other = self._by_step[name] = copy.copy(self)
             other.numerics = dc.replace(self.numerics, time_step=step)
-            other._longer = self
+            other._like = self
             other._set_step()
         return self._by_step[name]
 
@@ -600,9 +622,21 @@ class CuttingModel(CutGeometry):
             raise TypeError(f"a cut has no {', '.join(unknown)} to change")
         # With what was computed of the geometry.
         derived = copy.copy(self)
-        vars(derived).update(changes, _inertia_of=inertia_of, _strips=self._strips)
+        vars(derived).update(
+            changes,
+            _inertia_of=inertia_of,
+            _like=self._like or self,
+            _strips=self._strips,
+            _gradient=self._gradient,
+            _gradient_products=self._gradient_products,
+        )
         derived.__post_init__()
         return derived
+
+
+def _ratios(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Of positive numbers, where the second is not zero."""
+    return mine[theirs > 0.0] / theirs[theirs > 0.0]
 
 
 def prepare_cut(

@@ -64,6 +64,7 @@ class Sizes:
         self._plain: dict[tuple[bool, bool], list[np.ndarray]] = {}
         self._free: dict[bool, list[list[np.ndarray]]] = {}
         self._scales: dict[bool, list[np.ndarray]] = {}
+        self._signatures: dict[tuple[str, float], Signature] = {}
 
     def _slices(self, by_slice: bool) -> list[int]:
         """Numbers of the slices that are compared: of each condition the middle one, or all of two
@@ -119,11 +120,16 @@ class Sizes:
         return [a - b for a, b in zip(hidden, self._plain[key], strict=True)]
 
     def signature(self, name: str, size: float) -> Signature:
-        """What an effect of a size leaves.
+        """What an effect of a size leaves; computed once.
 
         Raises:
             CuttingError: A cut broke down.
         """
+        if (name, size) not in self._signatures:
+            self._signatures[name, size] = self._signature(name, size)
+        return self._signatures[name, size]
+
+    def _signature(self, name: str, size: float) -> Signature:
         kind = HIDDEN[name]
         self._known(kind.by_slice)
         changes, free = self._change(name, size), self._free[kind.by_slice]

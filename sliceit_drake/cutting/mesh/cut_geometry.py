@@ -5,6 +5,7 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import csc_array, csr_array
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.inertia import elimination_order
@@ -185,6 +186,18 @@ class CutGeometry:
         gradients = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
         products = gradients @ gradients.transpose(0, 2, 1)
         return np.sqrt(np.einsum("tii->ti", products)), products
+
+    @functools.cached_property
+    def _gradient(self) -> tuple[csr_array, csr_array]:
+        """What gives the gradient in each element for values at the moving nodes [3 T, K], and its
+        transpose."""
+        g = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
+        rows = np.broadcast_to(np.arange(3 * len(g)).reshape(-1, 1, 3), g.shape)
+        columns = np.broadcast_to(self.tetrahedra[:, :, None], g.shape)
+        entries = g.ravel(), (rows.ravel(), columns.ravel())
+        every = csc_array(entries, (3 * len(g), len(self.nodes)))
+        gradient = every[:, self.moving].tocsr()
+        return gradient, gradient.T.tocsr()
 
     def stiffness_bound(self, volume: np.ndarray, mu: float, lam: float) -> np.ndarray:
         """Gershgorin bound of the bulk stiffness at each node [N], N/m.
