@@ -155,8 +155,8 @@ TESTED = {
         " --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/{corrected,spring}_[0-4] output/corrected_spring_[0-4]"
         " --seed 11 --output docs/results/corrected_evaluation.jsonl",
-        "sliceit evaluate models/policies/corrected_[0-4] --world curves"
-        " --board-stiffness 3e3 3e5 --output docs/results/corrected_evaluation.jsonl",
+        "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e3 3e5"
+        " --output docs/results/corrected_evaluation.jsonl",
     ],
     "tests/test_foreign_law.py::test_policies_are_evaluated_by_it_and_finish": [
         "python -m studies foreign_law models/policies/{corrected,spring}_[0-4]"
