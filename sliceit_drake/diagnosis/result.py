@@ -132,7 +132,7 @@ class Diagnosis:
         """The result in a minute."""
         v, lines = self.verdict, []
         count, kinds = len(self.problem.found.records), len(self.problem.conditions)
-        lines.append(f"{count} records of {kinds} conditions")
+        lines.append(f"{count} records of {kinds} condition{'s' * (kinds > 1)}")
         lines.append(f"Verdict: {v.kind.replace('_', ' ')}: {v.reason}")
         for finding in v.findings:
             lines += self._lines(finding)
