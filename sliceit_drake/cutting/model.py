@@ -583,8 +583,10 @@ class CuttingModel(CutGeometry):
         return R, here - R @ centre, spin, mass @ v / mass.sum() - np.cross(spin, here)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy, also in another process, may get other values, and then has other inertia.
+        # A copy, also in another process, may get other values, and then has other inertia; and
+        # gradients are long to send.
         own = (
+            "_gradient",
             "inertia",
             "critical_time_step",
             "_unraised_masses",
