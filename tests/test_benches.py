@@ -357,6 +357,7 @@ def test_a_signature_is_what_a_refit_leaves(monkeypatch):
     sizes = Sizes(bench, Misfit(0.1, 0.1, 0.1, 0.1, 0.1, [1e-6, 1e-6, 1.0, 1e-6]))
     small, large = (sizes.signature("cross_talk", s) for s in (0.02, 0.04))
     assert large.size == pytest.approx(2.0 * small.size, rel=1e-3)
+    assert sizes.signature("cross_talk", 0.02) is small
     found = sizes.size_for("cross_talk", 2.0)
     assert found is not None and found[1].size == pytest.approx(2.0, rel=0.05)
     # A size that has no meaning is not hidden, however small the effect is beside what is wrong.
