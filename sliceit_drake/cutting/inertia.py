@@ -26,7 +26,7 @@ COST_OF_ROW = 10.0
 COST_OF_PRODUCT = 0.1
 """Of an entry of an inverse, over that of an entry in substitutions."""
 LANCZOS = 8
-"""Vectors of Lanczos's method: from a start near the motion, one round of them is enough."""
+"""Vectors of Lanczos's method: near the motion a round or two of them are enough."""
 
 
 @dc.dataclass(frozen=True)
