@@ -70,7 +70,8 @@ def rates(
     and number of tetrahedra."""
     models, motion = variants(device, count, refinement)
     pool = DriverPool(PERIOD)
-    # As `simulate_batch`, which makes arrays, graphs and mass matrices anew in each call.
+    # As `simulate_batch`, which makes arrays, graphs and mass matrices anew in each call; here the
+    # first makes them, and the others find them.
     groups = [[model] for model in models] if device == "cpu" else [models]
 
     def cut(driver: Driver, some: list[CuttingModel]) -> list[BatchSlice]:
