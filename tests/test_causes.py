@@ -5,6 +5,7 @@ import functools
 import re
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sliceit_drake.diagnosis import registry
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, FAMILIES, Cause, CauseParameter
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.causes.mounting import FoodSlip
-from sliceit_drake.diagnosis.causes.robot import StickSlip, Vibration
+from sliceit_drake.diagnosis.causes.robot import StickSlip, Vibration, _of_drives
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.searches import unlike_others
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
@@ -373,6 +374,22 @@ def test_a_hum_that_goes_with_the_speed_is_found_in_each_condition_and_the_mains
         spectrum = np.abs(np.fft.rfft(own[moving] * np.hanning(moving.sum()), 4096))
         at = np.fft.rfftfreq(4096, np.diff(record(condition).time)[0])[spectrum.argmax()]
         assert at == pytest.approx(frequency, rel=0.05)
+
+
+def test_the_mains_are_no_vibration_where_a_short_motion_tells_their_frequency_badly():
+    time = np.arange(0.0, 8.0, 0.008)
+    moves = (time > 3.0) & (time < 3.5)
+    path = 0.05 * np.cumsum(moves) * 0.008
+    noise = np.random.default_rng(0).normal(size=(len(time), 3))
+    found = {}
+    for name, at_rest in (("mains", 1.0), ("drives", 0.0)):
+        wave = np.sin(2.0 * np.pi * 33.4 * time) * np.where(moves, 1.0, at_rest)
+        hums = SimpleNamespace(
+            time=time, path=path, residual=0.4 * noise + wave[:, None], forces=[0, 1, 2]
+        )
+        found[name] = _of_drives([hums], [hums], 3.0, 60.0)
+    assert all(abs(f - 33.4) > 3.0 for f in found["mains"])
+    assert found["drives"][0] == pytest.approx(33.4, abs=1.0)
 
 
 def test_stick_slip_is_found_at_its_pitch_and_not_there_in_the_air():

@@ -4,6 +4,7 @@ The sensitivities are given shapes: no slice is simulated.
 """
 
 import dataclasses as dc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,13 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.diagnose import _with_known
-from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import (
+    MESH,
+    Column,
+    RecordSensitivity,
+    Sensitivities,
+)
+from sliceit_drake.diagnosis.evidence.confirm import predicted_at
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import centred_own
@@ -26,6 +33,7 @@ from sliceit_drake.diagnosis.known_error import (
     way_of,
     with_known_error,
 )
+from sliceit_drake.diagnosis.prediction import Point
 from sliceit_drake.prediction.discrepancy import Covariates, motion_shapes
 
 STEP = 5e-4
@@ -189,3 +197,19 @@ def test_less_is_asked_of_an_effect_where_what_looks_like_it_is_known():
     rule, e = DecisionRule(), screen(slices(11, 1.0), 20).evidence("skin")
     assert rule.least_size(slices(11, 1.0), e) == rule.size
     assert rule.least_size(slices(11, 1.0, known_from=12), e) == rule.size_known < rule.size
+
+
+@pytest.mark.parametrize("known_from", [0, 12])
+def test_what_is_simulated_is_seen_on_the_finer_mesh_also_where_an_error_is_known(known_from):
+    of = slices(11, 0.0, known_from=known_from)
+    records = of.found.records
+    (mesh,) = of.found.index("numerical", MESH.name)
+    coarse = [r.predicted + r.columns[:, :, mesh] for r in records]
+    assert any(r.columns[:, :, mesh].any() for r in records)
+    predictor = SimpleNamespace(
+        predict=lambda *_: [[SimpleNamespace(wrench=values) for values in coarse]],
+        targets=[SimpleNamespace(compare=lambda values: values)] * len(records),
+    )
+    again = predicted_at(Point(), of, predictor).found.records
+    for now, before in zip(again, records, strict=True):
+        np.testing.assert_allclose(now.predicted, before.predicted)

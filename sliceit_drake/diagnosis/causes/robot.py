@@ -15,6 +15,8 @@ __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 
 REST = 2e-3
 """Speed below which drives do not shake, m/s."""
+NEAR = 1.0
+"""By how much a frequency may be off, Hz."""
 
 
 class ToolWeight(Cause):
@@ -56,12 +58,12 @@ class Vibration(Cause):
         value of the scan, at that of each condition; the value is then their mean."""
         own: dict[str, float] = {}
         for members in replicates(records).values():
-            found = _of_drives([records[k] for k in members], *self.range)
+            found = _of_drives([records[k] for k in members], records, *self.range)
             own |= {records[k].name: f for f in found[:1] for k in members}
         mean = (float(np.mean([*own.values()])),) if own else ()
         out = Vibration()
         out._own = own
-        return _at(out, _of_drives(records, *self.range) + mean)
+        return _at(out, _of_drives(records, records, *self.range) + mean)
 
     def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the waves."""
@@ -127,27 +129,44 @@ class StickSlip(Cause):
         return out
 
 
-def _of_drives(records: Sequence[RecordSensitivity], low: float, high: float) -> tuple[float, ...]:
-    """Frequencies at which the residuals are strongest in motion and have less than half of that
-    amplitude at rest: the mains hum at rest as well."""
-    parts: dict[bool, list[tuple[np.ndarray, np.ndarray]]] = {True: [], False: []}
+def _of_drives(
+    records: Sequence[RecordSensitivity],
+    resting: Sequence[RecordSensitivity],
+    low: float,
+    high: float,
+) -> tuple[float, ...]:
+    """Frequencies at which the residuals of records are strongest in motion and have less than half
+    of that amplitude at rest, in any of `resting`: the mains hum at rest as well."""
+    moving, at_rest = _parts(records, True), _parts(resting, False)
+    # What rests for longer resolves a frequency better than what moved when it was found.
+    near = np.linspace(-NEAR, NEAR, 41)
+    return tuple(
+        f
+        for f in strongest_frequencies(moving, low, high)
+        if max(_square(at_rest, f + away) for away in near) < 0.25 * _square(moving, f)
+    )
+
+
+def _parts(
+    records: Sequence[RecordSensitivity], moves: bool
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Times [m] and residuals of the forces [m, c] of each record while it moves, or rests."""
+    out = []
     for r in records:
-        moving = np.gradient(r.path, r.time) > REST
-        for moves, of in parts.items():
-            rows = moving == moves
-            of.append((r.time[rows], r.residual[rows][:, r.forces]))
+        rows = (np.gradient(r.path, r.time) > REST) == moves
+        out.append((r.time[rows], r.residual[rows][:, r.forces]))
+    return out
 
-    def square(frequency: float, moves: bool) -> float:
-        power = rows = 0.0
-        for time, values in parts[moves]:
-            if len(time):
-                wave = np.exp(2j * np.pi * frequency * time)
-                power += float((np.abs(wave @ (values - values.mean(0))) ** 2).sum())
-                rows += len(time) ** 2
-        return power / max(rows, 1.0)
 
-    found = strongest_frequencies(parts[True], low, high)
-    return tuple(f for f in found if square(f, False) < 0.25 * square(f, True))
+def _square(parts: Sequence[tuple[np.ndarray, np.ndarray]], frequency: float) -> float:
+    """Mean square of the waves of a frequency."""
+    power = rows = 0.0
+    for time, values in parts:
+        if len(time):
+            wave = np.exp(2j * np.pi * frequency * time)
+            power += float((np.abs(wave @ (values - values.mean(0))) ** 2).sum())
+            rows += len(time) ** 2
+    return power / max(rows, 1.0)
 
 
 def _at(cause: Cause, values: tuple[float, ...]) -> Cause:

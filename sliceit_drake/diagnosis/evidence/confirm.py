@@ -14,7 +14,7 @@ import numpy as np
 
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.columns import Column
+from sliceit_drake.diagnosis.evidence.columns import MESH, Column
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 
@@ -164,12 +164,12 @@ def predicted_at(
 ) -> LinearProblem:
     """The problem with what slices simulated at a point predict."""
     (row,) = predictor.predict([point], progress)
+    # Also where an error is known, and the column is fitted no more.
+    mesh = problem.found.index("numerical", MESH.name)
     moved = []
     for record, target, series in zip(problem.found.records, predictor.targets, row, strict=True):
         assert series is not None
         seen = target.compare(series.wrench)
-        if problem.mesh is not None:
-            # Of the finer mesh, as the prediction is; its difference is taken from the base model.
-            seen = seen - record.columns[:, :, problem.mesh]
-        moved.append(seen)
+        # Of the finer mesh, as the prediction is; its difference is taken from the base model.
+        moved.append(seen - record.columns[:, :, mesh].sum(2))
     return problem.predicting(moved)
