@@ -38,6 +38,7 @@ __all__ = [
     "stepping_cases",
     "stepping_study",
     "true_step",
+    "turned_table",
 ]
 
 STEPS = (2.5e-5, 1.25e-4, 2.5e-4, 5e-4, 1e-3, 2e-3)
@@ -138,11 +139,14 @@ class StepResult:
         refusal: Why it broke down, or None.
         rms_error: RMS of the force's difference over RMS of the reference's force.
         largest_difference: N.
+        turned_error: What the rows from the turn on give of `rms_error`, the root of their part of
+            its square; not a number without a turn.
         peak: Of the reference's force, N.
         energy_ratio: Largest kinetic over internal energy, looked at every 0.2 mm of travel.
         substeps: Mean number of sub-steps of a coupling step.
         finer: Fraction of coupling steps with more than the fewest.
         by_event: Fraction with more than the knife's motion asks for.
+        stop: Coupling step in which the first segment of the motion ends.
         force_drop: Force before the stop less force 20 ms after it, N; not a number without hold.
         creep: Change of the force from then to the end of the hold, N; likewise.
         elements: Elements that are computed, and all of the split mesh.
@@ -156,11 +160,13 @@ class StepResult:
     refusal: str | None = None
     rms_error: float = np.nan
     largest_difference: float = np.nan
+    turned_error: float = np.nan
     peak: float = np.nan
     energy_ratio: float = np.nan
     substeps: float = np.nan
     finer: float = 0.0
     by_event: float = 0.0
+    stop: int = 0
     force_drop: float = np.nan
     creep: float = np.nan
     elements: tuple[int, int] = (0, 0)
@@ -296,6 +302,9 @@ def stepping_study(
             difference = np.linalg.norm(force - reference, axis=1)
             result.rms_error = float(np.linalg.norm(difference) / np.linalg.norm(reference))
             result.largest_difference = float(difference.max())
+            if case.retract:
+                after = np.linalg.norm(difference[result.stop :])
+                result.turned_error = float(after / np.linalg.norm(reference))
         results.append(result)
     return results
 
@@ -330,10 +339,10 @@ def _run(
     result.substeps = float(taken.mean())
     result.finer = float((taken > round(EXCHANGE / step)).mean())
     result.by_event = float((taken > planned).mean())
+    # Row k is the mean over the coupling step that ends at (k + 1) EXCHANGE.
+    stop = result.stop = int(motion.phases[0][2] / EXCHANGE + 1e-6)
     if case.hold:
         norm = np.linalg.norm(force, axis=1)
-        # Row k is the mean over the coupling step that ends at (k + 1) EXCHANGE.
-        stop = int(motion.phases[1][1] / EXCHANGE + 1e-6)
         settled = stop + round(SETTLED / EXCHANGE)
         result.force_drop = float(norm[stop - 1] - norm[settled])
         result.creep = float(norm[-1] - norm[settled])
@@ -456,6 +465,14 @@ def largest_table(results: Sequence[StepResult]) -> str:
         "largest difference [% of peak]",
         lambda r: 100.0 * r.largest_difference / r.peak,
         1,
+    )
+
+
+def turned_table(results: Sequence[StepResult]) -> str:
+    """What the rows from a turn on give of the RMS error; squares of the two parts add up."""
+    turns = [r for r in results if r.case.retract]
+    return _by_case(
+        turns, "of the RMS error, from the turn on [%]", lambda r: 100.0 * r.turned_error, 2
     )
 
 

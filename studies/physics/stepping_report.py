@@ -100,6 +100,7 @@ def run(options: argparse.Namespace) -> int:
     tables = {
         "errors": study.error_table(results),
         "largest": study.largest_table(results),
+        "turned": study.turned_table(results),
         "need": study.need_table(results),
         "energies": study.inertia_table(results),
         "holds": study.hold_table(results),
