@@ -45,6 +45,9 @@ DRIFT_LEAD = 1e-3
 SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
 
+SWING = 6.0
+"""Relaxation time of the blade beside its own, in steps: the inertia that its contacts need makes it
+heavy, and it would swing sideways for half a second after it has met the food."""
 LEAN = 0.15
 """Angle between a flank and the cut plane for which added inertia suffices, rad."""
 
@@ -251,7 +254,7 @@ class CuttingModel(CutGeometry):
             "board_friction": numerics.board_friction,
             "board_damping_time": numerics.board_damping_time,
             "blade_stiffness": knife.lateral_stiffness,
-            "blade_damping": knife.lateral_stiffness * knife.lateral_relaxation_time,
+            "blade_damping": knife.lateral_stiffness * self._blade_relaxation,
             "rate_exponent": effects.toughness_rate.exponent,
             "reference_speed": effects.toughness_rate.reference_speed,
             "slice_push_exponent": effects.slice_push.exponent,
@@ -317,7 +320,12 @@ class CuttingModel(CutGeometry):
     def _bending(self, x: float) -> float:
         """What the blade's spring and damper add to its entry, kg; see `_scaled_masses`."""
         knife = self.knife
-        return (0.25 * x**2 + 0.5 * x * knife.lateral_relaxation_time) * knife.lateral_stiffness
+        return (0.25 * x**2 + 0.5 * x * self._blade_relaxation) * knife.lateral_stiffness
+
+    @property
+    def _blade_relaxation(self) -> float:
+        """Damping of the blade over its stiffness, s."""
+        return self.knife.lateral_relaxation_time + SWING * self.numerics.time_step
 
     def _with_blade(self, parts: Any, diagonal: np.ndarray, entry: float) -> csc_array:
         """See `assemble`; the blade is the node after the last, with its own entry, kg."""

@@ -61,18 +61,19 @@ as much may be left at the board, into which the edge presses it."""
 CHECKED = 5
 """One slice in so many is cut twice more."""
 FINE_STEP = 5e-5
-"""Constant sub-step of the one, s."""
+"""Longest sub-step of the one, s."""
 SHORTEST_STEP = 3e-5
 """Shortest sub-step that a guard's advice is followed with, s."""
 STEP_ERROR, MIRROR_ERROR = 0.05, 0.01
 """Most that the force may differ from that with the fine step, and from that of the mirrored slice:
 root of the mean square over that of the force."""
 SHAPES = ("cylinder", "half cylinder", "tapered", "box", "plate", "ellipsoid")
+STEPS, MIRROR = "force against sub-steps of 0.05 ms", "force against the mirrored slice"
 MEASURES = {
     "energy balance, of the knife's work": IMBALANCE,
     "work of edge and opening less than R A of what is cut": Numerics().work_error,
-    "force against sub-steps of 0.05 ms": STEP_ERROR,
-    "force against the mirrored slice": MIRROR_ERROR,
+    STEPS: STEP_ERROR,
+    MIRROR: MIRROR_ERROR,
 }
 """What is measured of a slice that is cut, and its limit."""
 
@@ -147,6 +148,8 @@ class Outcome:
         shape: Of the food.
         peak: Greatest force of the food, N; of a cut.
         errors: Of a cut, by `MEASURES`.
+        let_go: Which of its `errors` are until the knife goes up, because what food does that is
+            dragged up and let go is not the same twice.
         advised: What came of another sub-step or `edge_spread`, where that was advised.
     """
 
@@ -156,6 +159,7 @@ class Outcome:
     peak: float = math.nan
     errors: dict[str, float] = dc.field(default_factory=dict)
     advised: str = ""
+    let_go: list[str] = dc.field(default_factory=list)
 
 
 def draw_slice(rng: np.random.Generator) -> RandomSlice:
@@ -261,26 +265,69 @@ def cut_random_slice(case: RandomSlice, twice_more: bool = False) -> Outcome:
         return Outcome("unexplained", f"{type(error).__name__}: {error}", case.kind)
     wrong, errors = _wrong(result, model, solver)
     force = result.food_wrench[:, 3:]
-    if twice_more and not wrong:
-        fine = dc.replace(case.numerics, time_step=FINE_STEP, step_by_need=False)
-        others = {
-            "force against sub-steps of 0.05 ms": (dc.replace(case, numerics=fine), False),
-            "force against the mirrored slice": (case, True),
-        }
-        for name, (other, mirrored) in others.items():
-            try:
-                _, again = _cut(other, _prepared(other, mirrored))
-            except CuttingError as error:
-                wrong = f"{name}: {error}"
-                break
-            there = again.food_wrench[:, 3:] * ([1.0, -1.0, 1.0] if mirrored else 1.0)
-            errors[name] = float(np.linalg.norm(there - force) / np.linalg.norm(force))
-            if errors[name] > MEASURES[name]:
-                wrong = f"{name}: {100 * errors[name]:.1f} % RMS apart"
+    let_go = []
+    for name, compared in ((STEPS, _with_short_steps), (MIRROR, _mirrored)):
+        if twice_more and not wrong:
+            errors[name], wrong, left_out = compared(case, force)
+            let_go += [name] if left_out and not wrong else []
+            wrong = wrong and f"{name}: {wrong}"
     if warned := wrong and [each for each in model.warnings if "the edge" in each]:
         return _stopped(case, model, f"{warned[0]} Here {wrong}")
     peak = float(np.linalg.norm(force, axis=1).max())
-    return Outcome("unexplained" if wrong else "cut", wrong, case.kind, peak, errors)
+    kind = "unexplained" if wrong else "cut"
+    return Outcome(kind, wrong, case.kind, peak, errors, let_go=let_go)
+
+
+def _with_short_steps(case: RandomSlice, force: np.ndarray) -> tuple[float, str, bool]:
+    """How far a slice's force [n, 3] is off that with short sub-steps, what is wrong with that, and
+    whether food that was let go is left out of it.
+
+    Where it is too far off, sub-steps half as short tell whether it, or the one that it is compared
+    with, is off, or neither: food that the blade drags up and lets go does not do the same again.
+    """
+    limit = MEASURES[STEPS]
+    references: list[np.ndarray | str] = []
+    for step in (FINE_STEP, 0.5 * FINE_STEP):
+        finer = dc.replace(case, numerics=dc.replace(case.numerics, time_step=step))
+        references.append(_force(finer))
+        error, wrong = _apart(force, references[-1], limit)
+        if not wrong:
+            return error, "", False
+    one, other = references
+    if not _apart(one, other, limit)[1]:
+        return error, wrong, False
+    return *_apart(force, _force(finer, rise=False), limit), True
+
+
+def _mirrored(case: RandomSlice, force: np.ndarray) -> tuple[float, str, bool]:
+    """As `_with_short_steps`, of the mirrored slice, which differs by rounding alone."""
+    limit = MEASURES[MIRROR]
+    error, wrong = _apart(force, _force(case, mirrored=True), limit)
+    if not wrong:
+        return error, "", False
+    return *_apart(force, _force(case, mirrored=True, rise=False), limit), True
+
+
+def _force(case: RandomSlice, mirrored: bool = False, rise: bool = True) -> np.ndarray | str:
+    """Force of the food on the knife [n, 3], N, of a mirrored slice mirrored back, or why there is
+    none; if not `rise`, until the knife goes up."""
+    try:
+        _, result = _cut(case, _prepared(case, mirrored), rise)
+    except CuttingError as error:
+        return str(error)
+    return np.asarray(result.food_wrench[:, 3:] * ([1.0, -1.0, 1.0] if mirrored else 1.0))
+
+
+def _apart(force: np.ndarray | str, other: np.ndarray | str, limit: float) -> tuple[float, str]:
+    """Root of the mean square of the difference of two forces over that of the first, as far as the
+    shorter goes; and what is wrong with it, if it passes a limit or a slice has none."""
+    for each in (force, other):
+        if isinstance(each, str):
+            return math.nan, each
+    assert not isinstance(force, str) and not isinstance(other, str)
+    count = min(len(force), len(other))
+    error = float(np.linalg.norm(other[:count] - force[:count]) / np.linalg.norm(force[:count]))
+    return error, f"{100 * error:.1f} % RMS apart" if error > limit else ""
 
 
 def _prepared(case: RandomSlice, mirrored: bool = False) -> CuttingModel:
@@ -298,7 +345,9 @@ def _prepared(case: RandomSlice, mirrored: bool = False) -> CuttingModel:
     return prepare_cut(geometry, food.material, knife, numerics, food.effects)
 
 
-def _cut(case: RandomSlice, model: CuttingModel) -> tuple[CuttingSolver, SliceResult]:
+def _cut(
+    case: RandomSlice, model: CuttingModel, rise: bool = True
+) -> tuple[CuttingSolver, SliceResult]:
     start = start_pose(model, CLEARANCE)
     distance = -start.p[2] / start.R[2, 2] + OVERTRAVEL
     segments: list[Segment] = [
@@ -306,7 +355,7 @@ def _cut(case: RandomSlice, model: CuttingModel) -> tuple[CuttingSolver, SliceRe
             case.speed, distance, case.draw_ratio, case.amplitude, case.frequency, case.acceleration
         ),
         *([Hold(case.hold)] if case.hold > 0.01 else []),
-        Retract(0.5 * distance, 0.1, acceleration=2.0),
+        *([Retract(0.5 * distance, 0.1, acceleration=2.0)] if rise else []),
     ]
     solver = CuttingSolver(model, EXCHANGE_PERIOD)
     motion = Motion(MotionPlan(segments), start)
@@ -412,6 +461,7 @@ def page_values(outcomes: list[Outcome], seed: int, command: str) -> dict[str, o
         checked=CHECKED,
         advised=len(advised),
         helped=advised.count("cut"),
+        let_go=sum(bool(outcome.let_go) for outcome in outcomes),
         kinds=KINDS,
         rows=[(shape, *(counts[shape, kind] for kind in KINDS)) for shape in shapes]
         + [("all", *(sum(counts[shape, kind] for shape in shapes) for kind in KINDS))],
