@@ -46,8 +46,8 @@ SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
 
 SWING = 6.0
-"""Relaxation time of the blade beside its own, in steps: the inertia that its contacts need makes it
-heavy, and it would swing sideways for half a second after it has met the food."""
+"""Relaxation time of the blade beside its own, in steps: the inertia that its contacts need makes
+it heavy, and it would swing sideways for half a second after it has met the food."""
 LEAN = 0.15
 """Angle between a flank and the cut plane for which added inertia suffices, rad."""
 
