@@ -25,6 +25,7 @@ __all__ = [
     "StepCost",
     "StepResult",
     "SteppingCase",
+    "aims_table",
     "cost_table",
     "error_table",
     "hold_table",
@@ -494,6 +495,40 @@ def hold_table(results: Sequence[StepResult]) -> str:
         name = f"{reference.case.label} ({reference.force_drop:.3f}, {reference.creep:+.4f})"
         rows.append([name, *(cells[column] for column in columns)])
     return _table("drop, creep [N] (reference)", columns, rows)
+
+
+AIMS = (
+    ("press and draw, 20 mm/s", 0.005),
+    ("press and draw, 100 mm/s", 0.005),
+    ("holds, 20 mm/s", 0.01),
+    ("holds, 100 mm/s", 0.01),
+    ("turning round, 5 to 100 mm/s", 0.015),
+)
+"""Kinds of cuts and the RMS error that was asked for; of turns at most a tenth of the peak, too."""
+
+
+def aims_table(results: Sequence[StepResult], foods: Sequence[str]) -> str:
+    """The largest RMS error by need of each kind of cut and food beside what was asked for; in
+    brackets the largest difference over the peak."""
+    worst: dict[tuple[str, str], tuple[float, float]] = {}
+    for r in results:
+        if r.by_need:
+            speed = f", {1e3 * r.case.press_speed:g} mm/s"
+            kind = "holds" + speed if r.case.hold else "press and draw" + speed
+            kind = AIMS[-1][0] if r.case.retract else kind
+            before = worst.get((kind, r.case.food.name), (0.0, 0.0))
+            found = r.rms_error, r.largest_difference / r.peak
+            worst[kind, r.case.food.name] = max(before[0], found[0]), max(before[1], found[1])
+    rows = []
+    for kind, limit in AIMS:
+        turns = kind == AIMS[-1][0]
+        cells = [kind, f"{limit:.1%}" + " (10 %)" * turns]
+        for food in foods:
+            rms, largest = worst[kind, food]
+            text = f"{rms:.2%} ({largest:.1%})"
+            cells.append(f"**{text}**" if rms > limit or turns and largest > 0.1 else text)
+        rows.append([cell.replace("%", " %").replace("  ", " ") for cell in cells])
+    return table(" | ".join(["motion", "asked for", *foods]), rows)
 
 
 def need_table(results: Sequence[StepResult]) -> str:

@@ -111,6 +111,7 @@ def run(options: argparse.Namespace) -> int:
     if few:
         publish("\n\n".join(tables.values()), page)
     else:
+        tables["aims"] = study.aims_table(results, [food.name for food, *_ in foods + others])
         tables["slices"] = study.inertia_by_step_table(foods)
         stations = []
         policy = load_scenario(resource_path("scenarios/cucumber_policy.yaml"))
