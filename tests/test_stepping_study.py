@@ -154,7 +154,7 @@ def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, cap
     assert text.strip() in capsys.readouterr().out
     quick = {t.split("|")[1].strip() for t in text.split("\n\n")}
     committed = {re.sub("to [0-9e.-]+ s", "to 0.00025 s", name) for name in committed_tables()}
-    of_the_whole = {"in the station", "stepped over true inertia"}
+    of_the_whole = {"in the station", "stepped over true inertia", "motion"}
     assert quick == committed - of_the_whole
     with (tmp_path / "stepping.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -170,18 +170,9 @@ def test_in_the_committed_tables_sub_steps_by_need_err_as_little_as_asked_for():
     _, largest = cells(tables["largest difference [% of peak]"])
     held_out = {"carrot (held out)", "apple (held out)"}
     assert {name.split(",")[0] for name in rms} >= {"cucumber", "potato", "tomato"} | held_out
-    # A soft food without damping rings (docs/results/stepping.md).
-    ringing = {"press, 100 mm/s": 1.0}
-    ringing |= {
-        "hold after a sudden stop, 100 mm/s": 2.0,
-        "hold after a ramp, 100 mm/s, 1 m/s2": 1.5,
-    }
-    misses = {f"tomato, {motion}": limit for motion, limit in ringing.items()}
-    # A skin that gives way a coupling step late.
-    misses["cucumber with skin, press, 20 mm/s"] = 1.0
     for name, row in rms.items():
         turns, holds = "retract" in name, "hold" in name
-        limit = misses.get(name, 1.5 if turns else 1.0 if holds else 0.5)
+        limit = 1.5 if turns else 1.0 if holds else 0.5
         # A star would mark what a simulation refuses.
         assert float(row[-1]) <= limit, name
         if turns:
@@ -194,5 +185,6 @@ def test_in_the_committed_tables_a_robots_food_errs_little_at_any_step():
     for row in rows:
         _, step, rms, *_ = (cell.strip() for cell in row.strip("| ").split("|"))
         errors.setdefault(float(step), []).append(float(rms))
-    assert max(map(max, errors.values())) <= 0.2
+    # What is asked for of a press, though these turn round as well.
+    assert max(map(max, errors.values())) <= 0.5
     assert 1e-3 in errors
