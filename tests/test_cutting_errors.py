@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.coupling_steps import Energies
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, MeshFile, Remainder
@@ -12,7 +13,12 @@ from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, TimeStepError
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, Pose, Waypoints
-from sliceit_drake.cutting.simulate import check_clear, check_in_plane, simulate_slice
+from sliceit_drake.cutting.simulate import (
+    check_clear,
+    check_energies,
+    check_in_plane,
+    simulate_slice,
+)
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 
 SMALL = Box(size=[0.02, 0.06, 0.02], divisions=[3, 3], layers=[0.0, 4e-3, 12e-3])
@@ -295,6 +301,21 @@ def test_very_soft_food_stops_with_time_element_and_cause():
         match=r"at \d.* s (element \d+ is inverted|the knife's force).*Use a .*finer mesh",
     ):
         simulate_slice(solver, motion, check_period=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("height", "cut_through", "cause"),
+    [(59e-3, 1.0, "the edge deforms"), (0.01, 0.9, "the edge deforms"), (0.01, 1.0, "10 of 27 mm")],
+)
+def test_food_that_inverts_over_the_spine_of_a_low_blade_is_told_from_food_at_its_edge(
+    height, cut_through, cause
+):
+    model = make_food_model(Food(shape=SMALL), Knife(height=height), Numerics())
+    energies = Energies(0.1, 0.0, 0.0, 0.0, 1e-3, 0.0, 0.0, -0.1, 7)
+    with pytest.raises(
+        CuttingError, match=rf"element 7 is inverted \(volume ratio -0\.1\): .*{cause}"
+    ):
+        check_energies(energies, 0.1, model, 1.0, cut_through)
 
 
 def test_a_slice_too_fast_for_its_mass_scaling_is_refused():

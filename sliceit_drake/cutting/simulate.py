@@ -161,10 +161,20 @@ def check_energies(
         CuttingError: With time, element and cause.
     """
     if energies.least_volume_ratio <= 0.0:
-        raise CuttingError(
+        inverted = (
             f"at {time:.4g} s element {energies.min_element} is inverted (volume ratio "
-            f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
-            f"follow. Toughness / (E h) is {model.softness:.2g}, and a skin's line load / (E h) "
+            f"{energies.least_volume_ratio:.3g})"
+        )
+        height, blade = model.top - model.bottom, model.knife.height
+        if cut >= COMPLETE and blade < height:
+            raise CuttingError(
+                f"{inverted}: the blade is lower than the food, {1e3 * blade:.3g} of "
+                f"{1e3 * height:.3g} mm. What it has cut closes over its spine, which pushes it "
+                "open as the knife goes up. Use a higher knife (knife.height), or do not go up."
+            )
+        raise CuttingError(
+            f"{inverted}: the edge deforms the food more than its mesh can follow. "
+            f"Toughness / (E h) is {model.softness:.2g}, and a skin's line load / (E h) "
             f"{model.skin_softness:.2g}; above about 0.5 and 0.3 elements at the edge invert. Give "
             f"numerics.edge_spread: {model.wide_spread:.3g}, or a stiffer wall under a skin. Use a "
             "stiffer or less tough food where that is too wide; a finer mesh alone rarely helps."

@@ -364,7 +364,8 @@ def _cut(
 
 def _stopped(case: RandomSlice, model: CuttingModel, reason: str) -> Outcome:
     """What a guard has stopped: whether it was warned of, and what the guard's advice is worth."""
-    if "is inverted" in reason and not any("the edge" in each for each in model.warnings):
+    by_edge = "is inverted" in reason and "blade is lower" not in reason
+    if by_edge and not any("the edge" in each for each in model.warnings):
         return Outcome("unexplained", f"no warning, and {reason}", case.kind)
     here = re.search(r"the sub-step here, (\S+) s", reason)
     step = 0.25 * (float(here[1]) if here else case.numerics.time_step)
