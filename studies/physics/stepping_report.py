@@ -2,8 +2,8 @@
 
 Presses, draws, turns and holds in five foods at 5 to 100 mm/s, with constant steps of 2e-5 to 2e-3
 s and with steps by need: against true masses where the cut is fast, against the finest step where
-it is slow; some with an effect that is sensitive to the step; then the station. Takes 5 to 40 minutes,
---quick half a minute. docs/results/stepping.md explains what comes out.
+it is slow; some with an effect that is sensitive to the step; then the station. Takes 5 to 40
+minutes, --quick half a minute. docs/results/stepping.md explains what comes out.
 """
 
 import argparse
