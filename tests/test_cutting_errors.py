@@ -305,7 +305,11 @@ def test_very_soft_food_stops_with_time_element_and_cause():
 
 @pytest.mark.parametrize(
     ("height", "cut_through", "cause"),
-    [(59e-3, 1.0, "the edge deforms"), (0.01, 0.9, "the edge deforms"), (0.01, 1.0, r"10 of [\d.]+ mm")],
+    [
+        (59e-3, 1.0, "the edge deforms"),
+        (0.01, 0.9, "the edge deforms"),
+        (0.01, 1.0, r"10 of [\d.]+ mm"),
+    ],
 )
 def test_food_that_inverts_over_the_spine_of_a_low_blade_is_told_from_food_at_its_edge(
     height, cut_through, cause
