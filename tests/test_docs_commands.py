@@ -289,7 +289,6 @@ READ_ONLY = {
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
-        python -m studies random --count 50 --seed 1 --output docs/results
         python -m studies real --output docs/results
         python -m studies stepping --output FOLDER
         python -m studies stepping --foods tomato_sequence
