@@ -17,6 +17,7 @@ from sliceit_drake.calibration.gauss_newton import gauss_newton, linearise
 from sliceit_drake.calibration.setup import load_setup, setup_of_record
 from sliceit_drake.calibration.structure import (
     StructureChoice,
+    _Fitted,
     choice_in,
     choose_structure,
     find_puncture,
@@ -246,6 +247,25 @@ def test_a_skin_of_the_setup_that_a_coarse_mesh_cannot_show_is_taken_on_the_setu
     assert any(f"The setup's own food, with skin: {said}" in line for line in choice.lines)
     assert choice.taken == (["skin"] if left_out == 0.8 else [])
     assert (choice.setup is tomato) == (left_out == 0.8)
+
+
+@pytest.mark.parametrize(("refitted", "taken"), [(0.4, ["skin"]), (1.2, [])])
+def test_left_out_depth_is_asked_by_fits_where_linear_ones_refuse_what_records_ask_for(
+    monkeypatch, refitted, taken
+):
+    tomato = load_setup("tomato")
+    plain = _Fitted(tomato, {}, 1.0, 1.0, "without", SimpleNamespace(unit=np.zeros(1)))
+    # Linear ones see a snap, and give the skin ten times its error on the records.
+    whole = dc.replace(plain, rms=0.3, left_out=3.0, predictor="with")
+    errors = {"without": 1.0, "with": refitted}
+    monkeypatch.setattr(structure, "_fit", lambda _, setup, __: dc.replace(plain, setup=setup))
+    monkeypatch.setattr(structure, "_trials", lambda *_: [])
+    monkeypatch.setattr(structure, "_as_given", lambda *_: whole)
+    monkeypatch.setattr(
+        structure, "blocked_error", lambda model, *_: SimpleNamespace(rms=errors[model])
+    )
+    record = load_record(resource_path("calibration/records/tomato.csv"))
+    assert choose_structure(tomato, [record], 1).taken == taken
 
 
 @pytest.mark.second_tier

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.calibration.calibrate import depth_blocks, fingerprint
+from sliceit_drake.calibration.calibrate import blocked_error, depth_blocks, fingerprint
 from sliceit_drake.calibration.gauss_newton import (
     PRIOR_CENTER,
     PRIOR_VARIANCE,
@@ -59,6 +59,8 @@ FITTED, OF_ONE = 5, 2
 """Most fits before an element is taken, and most of one element: those that promise most."""
 FAR = 3.0
 """Error over that of the best minimum above which another one is given up."""
+MUCH = 0.5
+"""Share of the error on the records below which left-out depth is asked by fits, if it refuses."""
 GAIN = 0.05
 """Part of the error on left-out depth by which an element must lower it."""
 ALIKE = 0.1
@@ -304,6 +306,8 @@ def choose_structure(
             coarse_predictor(current.setup, records, workers, 1.0), current.setup, current.values
         )
         whole = _as_given(setup, records, workers)
+        if fine is not None and whole is not None and _disagrees(fine, whole):
+            fine, whole = _refitted(fine), _refitted(whole)
         if whole is None:
             lines.append(f"{named}: left, its slices break down")
         elif fine is not None and whole.left_out > (1.0 - GAIN) * fine.left_out:
@@ -336,6 +340,20 @@ def _as_given(
     """The setup as it is, fitted on its mesh; None where its slices break down."""
     predictor = coarse_predictor(setup, records, workers, 1.0)
     return _fit(predictor, setup, first_starts(predictor)[0])
+
+
+def _disagrees(before: _Fitted, after: _Fitted) -> bool:
+    """Whether records ask for a structure that the error on left-out depth refuses."""
+    return after.left_out > (1.0 - GAIN) * before.left_out and after.rms < MUCH * before.rms
+
+
+def _refitted(fit: _Fitted) -> _Fitted:
+    """With the error on left-out depth of fits to the rest, in place of linear ones, which say
+    anything of a block in which a slice snaps."""
+    try:
+        return dc.replace(fit, left_out=blocked_error(fit.predictor, fit.at.unit, BLOCKS).rms)
+    except CuttingError:
+        return fit
 
 
 def _change(before: _Fitted, after: _Fitted) -> str:
