@@ -1,9 +1,6 @@
 """The program `sliceit`: each command parses its arguments, calls its package, and prints."""
 
-import os
-import sys
-
-__all__ = ["ended", "start"]
+__all__ = ["start"]
 
 
 def start() -> int:
@@ -11,19 +8,8 @@ def start() -> int:
     try:
         from sliceit_drake.cli.main import main
     except KeyboardInterrupt:
+        import sys
+
         print("sliceit: interrupted. The same command starts again.", file=sys.stderr)
         return 130
-    return ended(main())
-
-
-def ended(status: int) -> int:
-    """The status that the process is to end with; ends it here where a robot's link was lost.
-
-    Threads of ur_rtde connect again then, and what frees them can hang or crash.
-    """
-    client = sys.modules.get("sliceit_drake.hardware.ur_client")
-    if client is not None and client.LOST:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    return status
+    return main()

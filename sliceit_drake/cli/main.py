@@ -275,6 +275,4 @@ def _is_bad_input(error: Exception) -> bool:
 
 
 if __name__ == "__main__":
-    from sliceit_drake.cli import ended
-
-    sys.exit(ended(main()))
+    sys.exit(main())

@@ -19,7 +19,7 @@ from sliceit_drake.hardware.control_script import NOTHING, control_script, uploa
 from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.hardware.supervisor import Supervisor
 
-__all__ = ["LOST", "UrClient"]
+__all__ = ["UrClient"]
 
 RATE = 500.0
 DECELERATION = 2.0
@@ -36,10 +36,6 @@ SLOWEST = 0.2
 
 
 _T = TypeVar("_T")
-
-
-LOST: list["UrClient"] = []
-"""Clients whose link was lost. ur_rtde hangs or crashes in what frees them."""
 
 
 class UrClient:
@@ -303,10 +299,6 @@ class UrClient:
             # Left alone it would go on with what it does.
             with contextlib.suppress(RuntimeError):
                 self.stop()
-        if self._was_lost:
-            # Its threads connect again, and read the empty script; `cli.ended` ends them.
-            LOST.append(self)
-            return
         for part in (self._control, self._receive, self._dashboard):
             # A link that is gone already cannot be closed better.
             with contextlib.suppress(RuntimeError), self._limit():
