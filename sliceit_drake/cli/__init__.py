@@ -1,6 +1,9 @@
 """The program `sliceit`: each command parses its arguments, calls its package, and prints."""
 
-__all__ = ["start"]
+import os
+import sys
+
+__all__ = ["ended", "start"]
 
 
 def start() -> int:
@@ -8,8 +11,19 @@ def start() -> int:
     try:
         from sliceit_drake.cli.main import main
     except KeyboardInterrupt:
-        import sys
-
         print("sliceit: interrupted. The same command starts again.", file=sys.stderr)
         return 130
-    return main()
+    return ended(main())
+
+
+def ended(status: int) -> int:
+    """The status that the process ends with; after a lost link to a robot it ends here, at once.
+
+    The usual end frees what ur_rtde has made, which crashes then.
+    """
+    client = sys.modules.get("sliceit_drake.hardware.ur_client")
+    if client is not None and client.LOST:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status

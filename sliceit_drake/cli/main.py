@@ -275,4 +275,6 @@ def _is_bad_input(error: Exception) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from sliceit_drake.cli import ended
+
+    sys.exit(ended(main()))

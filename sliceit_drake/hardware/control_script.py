@@ -6,6 +6,7 @@ program again and again: it is given one that does nothing.
 """
 
 import socket
+from pathlib import Path
 
 __all__ = ["NOTHING", "control_script", "upload"]
 
@@ -182,12 +183,8 @@ end
 """
 
 
-NOTHING = """\
-def rtde_control():
-  textmsg("sliceit_drake: a connection was lost, the program has ended")
-end
-"""
-"""A program that ends at once, in the place of any that runs."""
+NOTHING = Path(__file__).with_name("nothing.script")
+"""File of a program that ends at once, in the place of any that runs."""
 
 
 def control_script(joint_step: float, joint_speed: float) -> str:

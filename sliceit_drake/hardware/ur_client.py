@@ -8,7 +8,6 @@ ours (`control_script`), which ur_rtde does not upload anew.
 
 import contextlib
 import re
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from sliceit_drake.hardware.control_script import NOTHING, control_script, uploa
 from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.hardware.supervisor import Supervisor
 
-__all__ = ["UrClient"]
+__all__ = ["LOST", "UrClient"]
 
 RATE = 500.0
 DECELERATION = 2.0
@@ -34,6 +33,9 @@ tells the operator that the robot does not answer, and lets go of the connection
 SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
+LOST: list[object] = []
+"""What ur_rtde made for lost links. Its threads connect again and again, even once they are told to
+disconnect, and crash the process if it is freed, also at the process's usual end."""
 
 _T = TypeVar("_T")
 
@@ -91,7 +93,8 @@ class UrClient:
             kind = rtde_control.RTDEControlInterface
             flags = kind.FLAG_CUSTOM_SCRIPT | kind.FLAG_NO_WAIT
             self._control = kind(host, RATE, flags)
-            self._never_upload_again()
+            # ur_rtde keeps the name alone, and reads the file when it has reconnected.
+            self._control.setCustomScriptFile(str(NOTHING))
             limits = limits or SafetyLimits()
             script = control_script(limits.joint_step, max(limits.joint_speed))
             if supervisor is not None:
@@ -134,13 +137,6 @@ class UrClient:
                     "pendant, and start again."
                 )
             time.sleep(0.05)
-
-    def _never_upload_again(self) -> None:
-        # ur_rtde keeps the name alone, and reads the file when it has reconnected.
-        self._nothing = tempfile.NamedTemporaryFile("w", suffix=".script", encoding="ascii")
-        self._nothing.write(NOTHING)
-        self._nothing.flush()
-        self._control.setCustomScriptFile(self._nothing.name)
 
     def _await_program(self, patience: float) -> None:
         deadline = time.monotonic() + patience
@@ -299,9 +295,11 @@ class UrClient:
             # Left alone it would go on with what it does.
             with contextlib.suppress(RuntimeError):
                 self.stop()
-        for part in (self._control, self._receive, self._dashboard):
+        parts = self._control, self._receive, self._dashboard
+        if self._was_lost or not self.is_connected():
+            LOST.extend(parts)
+        for part in parts:
             # A link that is gone already cannot be closed better.
             with contextlib.suppress(RuntimeError), self._limit():
                 part.disconnect()
         self._script.close()
-        self._nothing.close()
