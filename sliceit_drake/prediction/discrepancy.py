@@ -60,8 +60,9 @@ FIRST_REST, LAST_REST = 0.03, 3.0
 """Times within which a force at rest changes, s."""
 USUAL_SHARE = 0.02
 """Median before any data of a channel's size, relative to the root mean square force."""
-PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0}
-"""Standard deviations of the logarithms of the sizes before any data."""
+PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0, "board": 0.5}
+"""Standard deviations of the logarithms of the sizes before any data; that of the phase in the board
+is less: what is wrong there is the bench, a board or an arm that gives, far more than the food."""
 JITTER = 1e-8
 """Added to the diagonal of what is inverted, relative to it."""
 LESS = 0.5
@@ -338,7 +339,11 @@ class Discrepancy:
         less = np.log(np.full(3 + phases, LESS))
         self.prior = Sizes(np.log(usual), less[:3], less[3:])
         self.spread = np.concatenate(
-            [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
+            [
+                np.full(len(usual), PRIOR["channel"]),
+                [PRIOR["part"]] * 3,
+                [PRIOR["board" if name == "board" else "phase"] for name in PHASES[1:]],
+            ]
         )
 
     def factor(self, of: Covariates) -> np.ndarray:

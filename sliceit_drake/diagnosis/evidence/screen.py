@@ -38,7 +38,7 @@ from sliceit_drake.diagnosis.evidence.linear import (
 )
 from sliceit_drake.prediction.discrepancy import Sizes
 
-__all__ = ["CauseEvidence", "Screening", "screen"]
+__all__ = ["CauseEvidence", "Screening", "gain_alone", "screen"]
 
 MIN_DEVIATION = 0.5
 """Least standard deviation of a gain by chance: a gain of next to nothing proves no cause."""
@@ -354,6 +354,15 @@ def screen(
         assumed=assumed,
         sizes=statistics.sizes,
     )
+
+
+def gain_alone(problem: LinearProblem, cause: CauseAtScan) -> float:
+    """Twice the gain in log-likelihood by a cause with no other in the model."""
+    statistics = _Statistics(problem, ())
+    columns = statistics.options[cause]
+    if problem.found.columns[columns[0]].per_record:
+        return statistics.own_gain(columns)
+    return float(statistics.best(statistics.projected[-1:, columns], columns)[0][0])
 
 
 def _evidence(

@@ -18,7 +18,7 @@ from sliceit_drake.diagnosis.evidence.linear import (
     fitted_covariance,
 )
 from sliceit_drake.diagnosis.evidence.scatter import scatter_of_replicates
-from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, screen
+from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, gain_alone, screen
 from sliceit_drake.diagnosis.evidence.trends import Trend, trend_of_slices
 
 __all__ = [
@@ -56,6 +56,8 @@ class DecisionRule:
             wrong by beside the cause over the noise, or 1 where that is less, as in the air: where
             it is wrong in a form that the prior does not have, causes gain up to this.
         beside: The same of a cause beside others that are named: these too may be of another form.
+        left: Least share of its gain alone that a cause keeps beside others. Less is what a form of
+            theirs leaves: of a saw-tooth, waves at the frequency that it has at one speed.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
             causes of up to this size.
@@ -76,6 +78,7 @@ class DecisionRule:
     alarm: float = 0.02
     gain: float = 1.1
     beside: float = 3.0
+    left: float = 0.05
     size: float = 0.9
     size_by_record: float = 0.5
     size_known: float = 0.7
@@ -360,6 +363,8 @@ def _refusal(
     least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
     if e.gain < least:
         return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
+    if before and e.gain < rule.left * (alone := gain_alone(problem, e.cause)):
+        return f"gains {e.gain:.0f}, but {alone:.0f} without {', '.join(n for n, _ in before)}"
     if not e.per_record and not foretells(problem, e.cause, before, wrong):
         return "does not foretell records that were left out"
     return ""
