@@ -222,6 +222,29 @@ def test_what_differs_from_record_to_record_is_asked_for_less_of_the_noise():
     assert reach_verdict(whole, 60, rule=strict).names == []
 
 
+def test_what_the_form_of_a_named_cause_leaves_is_no_second_cause():
+    """The waves of a saw-tooth along the path are, at one speed, waves of one frequency in time."""
+    found, pitch = problem(44).found, 1.5e-3
+    saw = [Column("cause", "saw", f"wave_{n}", per_record=True) for n in range(4)]
+    hum = [Column("cause", "hum", f"wave_{n}", per_record=True) for n in range(2)]
+    for k, r in enumerate(found.records):
+        cycles = r.depth / pitch
+        inside = r.in_contact & (np.gradient(r.depth, r.time) > 0.0)
+        # The pitch is not found exactly, and two harmonics are not a saw-tooth.
+        angles = [2.0 * np.pi * n * cycles * 1.001 for n in (1, 2)]
+        angles += [2.0 * np.pi * 0.01 / 0.9 / pitch * r.time]
+        waves = np.column_stack([f(a) * inside for a in angles for f in (np.sin, np.cos)])
+        columns = np.concatenate([r.columns, waves[:, None]], axis=2)
+        measured = r.measured + 4.0 * (inside * (np.mod(cycles, 1.0) - 0.5))[:, None]
+        even = np.zeros_like(columns)
+        found.records[k] = dc.replace(r, columns=columns, measured=measured, even=even)
+    whole = LinearProblem(Sensitivities([*found.columns, *saw, *hum], found.records))
+    verdict = reach_verdict(whole, 60)
+    assert verdict.names == [["saw"]]
+    assert "without saw" in next(c.why for c in verdict.causes if c.name == "hum")
+    assert ["hum"] in reach_verdict(whole, 60, rule=DecisionRule(left=0.0)).names
+
+
 def test_what_no_cause_explains_is_unknown():
     assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
 

@@ -115,6 +115,20 @@ def test_a_hidden_effect_is_found_alone(cache, tmp_path, effect, seed, cause, of
     assert 0 < page.index("<img") < page.index(text) < page.index("<pre>")
 
 
+def test_an_arm_that_gives_on_the_board_is_not_the_simulations_own_error(cache):
+    protocol = load_protocol(str(resource_path("calibration/protocols/rich.yaml")))
+    chosen = ("press", "press_fast", "draw_1")
+    protocol.conditions = [c for c in protocol.conditions if c.label in chosen]
+    effect = make_effect("arm_compliance:7.5e-6")
+    session = Session(protocol, [effect], seed=67, settings=WORLD)
+    records = [session.record(k) for k in range(len(session))]
+    setup = setup_of_food(CalibratedFood(food=protocol.food, knife=protocol.knife), REFINEMENT)
+    result = diagnose(setup, records, cache=cache, replicates=REPLICATES, workers=1)
+    assert result.verdict.names == [["arm_compliance"]]
+    (finding,) = result.verdict.findings
+    assert finding.size > 1.5 and result.verdict.own_error < 0.04
+
+
 @pytest.mark.parametrize(
     ("effect", "seed", "cause"),
     [("blunt_edge:0.9", 53, "bluntness"), ("sensor_drift:0.6", 57, "sensor_zero")],
