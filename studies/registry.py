@@ -260,6 +260,7 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         ),
         Study("pages", "project.stored_pages", "renders all pages from stored results", "10 s"),
         Study("aims", "project.aims", "writes results/benchmarks.md from stored results", "1 s"),
+        Study("stale", "project.stale", "results that are older than today's numbers", "2 s"),
         Study("first_run", "project.first_run", "a newcomer's first run with the wheel", "2 min"),
         Study(
             "notebooks",

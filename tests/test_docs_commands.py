@@ -210,6 +210,9 @@ TESTED = {
     "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [
         "python -m studies aims",
     ],
+    "tests/test_stale_results.py::test_each_file_shows_what_has_changed_since_it_was_committed": [
+        "python -m studies stale",
+    ],
     "tests/test_readme.py::test_every_page_of_a_study_is_rendered_from_its_stored_results": [
         "python -m studies pages",
     ],
