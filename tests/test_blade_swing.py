@@ -1,4 +1,4 @@
-"""Where sub-steps are long the blade is heavy against the faces of the cut: it must not swing on."""
+"""Where sub-steps are long the blade is heavy against the faces of the cut: it must not swing."""
 
 import numpy as np
 import pytest
