@@ -112,7 +112,7 @@ TESTED = {
     "tests/test_next_experiment.py::test_the_proposed_slices_find_what_was_hidden": [
         "sliceit diagnose records/monday --model cucumber --output output/a"
         " --next-experiment next.yaml",
-        "sliceit diagnose old --model food.yaml --refinement 0.5 --output a"
+        "sliceit diagnose old --model food.yaml --refinement 0.75 --output a"
         " --next-experiment next.yaml",
         "sliceit diagnose records/monday records/tuesday --model cucumber --output output/b",
         "sliceit diagnose --next-experiment FILE",
@@ -272,8 +272,8 @@ READ_ONLY = {
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
         sliceit calibrate --food carrot --literature --output DIR
-        sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
-        sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
+        sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.85 --seed 32 --output old
+        sliceit record next.yaml --replicates 4 --effect skin --refinement 0.85 --seed 132 --output new
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
