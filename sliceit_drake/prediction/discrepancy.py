@@ -60,7 +60,7 @@ FIRST_REST, LAST_REST = 0.03, 3.0
 """Times within which a force at rest changes, s."""
 USUAL_SHARE = 0.02
 """Median before any data of a channel's size, relative to the root mean square force."""
-PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0, "board": 0.5}
+PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0, "board": 0.65}
 """Standard deviations of the logarithms of the sizes before any data. In the board it is less: what
 is wrong there is an arm or a board that gives, rather than the law of the food."""
 JITTER = 1e-8
