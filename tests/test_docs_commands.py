@@ -290,6 +290,7 @@ READ_ONLY = {
         python -m studies bench_score docs/results/benches_report.jsonl
         python -m studies half_depth --output docs/figures/half_depth.png
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
+        python -m studies hidden --output output/hidden --seed 27 --replicates 100 --minutes 55
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
         python -m studies real --output docs/results
