@@ -1,5 +1,6 @@
 """A diagnosis from records to a result: what is wrong, why, how much, and the extended model."""
 
+import dataclasses as dc
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
+from sliceit_drake.diagnosis.extension import extended_food
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.known_error import record_key, with_known_error
 from sliceit_drake.diagnosis.prediction import SlicePredictor
@@ -36,6 +38,11 @@ BASE = (
 )
 """Base parameters of a calibrated food: a shift of theirs is reported as such."""
 MIN_RECORDS = 2
+FAR = 0.1
+"""Logarithm of a shift of a base parameter, two of the derivatives' steps: where more is needed and
+the verdict is unknown, records are judged once more by the food at these values."""
+MOVES = 4
+"""Most times that they are."""
 
 
 def setup_of_food(
@@ -100,59 +107,101 @@ def diagnose(
     remarks = check_records(records, setup.food, other_food)
     records = without_lone_torques(records)
     causes = open_causes([p.name for p in setup.parameters], extra)
-    found = sensitivities(
-        setup,
-        records,
-        causes,
-        cache=cache,
-        workers=workers,
-        progress=lambda done, total: show("simulations", done, total),
-    )
-    remarks += found.warnings
-    if known is not None:
-        found, why = _with_known(found, known, records, setup.refinement)
-        remarks += why
-    predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
-    problem = at_own_values(
-        LinearProblem(found, may_be_uneven=found.known_from > 0),
-        predictor,
-        lambda done, total: show("own values", done, total),
-    )
-    if not problem.repeated:
-        remarks.append(
-            "No condition was repeated: noise is from what is rough in the residuals, and how "
-            "slices vary is unknown. Repeat each cut at least 3 times."
-        )
-    steps = (DecisionRule.most + 1) * replicates
-    done = [0]
+    judge = _Judge(records, causes, cache, replicates, seed, workers, show, known)
+    result = judge(setup, remarks)
+    factors = dict.fromkeys(result.shifts, 1.0)
+    moves = MOVES if result.verdict.kind == "unknown" else 0
+    for _ in range(moves):
+        # What is left may be what a large shift does beyond its derivatives.
+        near = all(abs(np.log(factor)) < FAR for factor, _ in result.shifts.values())
+        if near or result.verdict.names:
+            break
+        there = {name: factors[name] * factor for name, (factor, _) in result.shifts.items()}
+        moved, _ = extended_food(setup, there, [])
+        again = judge(dc.replace(setup, food=moved.food), remarks)
+        if again.verdict.misfit >= result.verdict.misfit:
+            break
+        factors, result = there, again
+    result.setup = setup
+    result.shifts = {
+        n: (factors[n] * factor, error) for n, (factor, error) in result.shifts.items()
+    }
+    return result
 
-    def count(more: int) -> None:
-        done[0] += more
-        # Screenings that are repeated are more than these.
-        show("bootstrap", min(done[0], steps), steps)
 
-    by_name = {c.name: c for c in causes}
-    at_size = AtSize(predictor, by_name, lambda done, total: show("at size", done, total))
-    refuted: dict[str, str] = {}
-    while True:
-        verdict = reach_verdict(problem, replicates, seed, count, at_size=at_size, refuted=refuted)
-        show("bootstrap", steps, steps)
-        problem = verdict.problem
-        result = Diagnosis(
-            verdict=verdict,
-            problem=problem,
-            setup=setup,
-            causes=by_name,
-            shifts=_shifts(problem, verdict.named),
-            gain=None,
-            remarks=list(remarks),
-            known=known,
+@dc.dataclass
+class _Judge:
+    """Judges records by what a food predicts and what its derivatives say; fields as `diagnose`."""
+
+    records: Sequence[SliceRecord]
+    causes: Sequence[Cause]
+    cache: Path | None
+    replicates: int
+    seed: int
+    workers: Workers
+    show: Progress
+    known: KnownError | None
+
+    def __call__(self, setup: CalibrationSetup, remarks: Sequence[str]) -> Diagnosis:
+        """What a diagnosis by one food finds; the remarks stand before its own."""
+        records, show, remarks = self.records, self.show, list(remarks)
+        found = sensitivities(
+            setup,
+            records,
+            self.causes,
+            cache=self.cache,
+            workers=self.workers,
+            progress=lambda done, total: show("simulations", done, total),
         )
-        if verdict.names:
-            result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
-        if not (found_wrong := result.refuted()):
-            return result
-        refuted |= found_wrong
+        remarks += found.warnings
+        if self.known is not None:
+            found, why = _with_known(found, self.known, records, setup.refinement)
+            remarks += why
+        predictor = SlicePredictor(setup, records, cache=self.cache, workers=self.workers)
+        problem = at_own_values(
+            LinearProblem(found, may_be_uneven=found.known_from > 0),
+            predictor,
+            lambda done, total: show("own values", done, total),
+        )
+        if not problem.repeated:
+            remarks.append(
+                "No condition was repeated: noise is from what is rough in the residuals, and how "
+                "slices vary is unknown. Repeat each cut at least 3 times."
+            )
+        steps = (DecisionRule.most + 1) * self.replicates
+        done = [0]
+
+        def count(more: int) -> None:
+            done[0] += more
+            # Screenings that are repeated are more than these.
+            show("bootstrap", min(done[0], steps), steps)
+
+        by_name = {c.name: c for c in self.causes}
+        at_size = AtSize(predictor, by_name, lambda done, total: show("at size", done, total))
+        refuted: dict[str, str] = {}
+        while True:
+            verdict = reach_verdict(
+                problem, self.replicates, self.seed, count, at_size=at_size, refuted=refuted
+            )
+            show("bootstrap", steps, steps)
+            problem = verdict.problem
+            result = Diagnosis(
+                verdict=verdict,
+                problem=problem,
+                setup=setup,
+                causes=by_name,
+                shifts=_shifts(problem, verdict.named),
+                gain=None,
+                remarks=list(remarks),
+                known=self.known,
+            )
+            if verdict.names:
+                result.confirm(
+                    predictor, self.seed, lambda done, total: show("confirmation", done, total)
+                )
+            if not (found_wrong := result.refuted()):
+                return result
+            refuted |= found_wrong
 
 
 def _with_known(
