@@ -128,6 +128,22 @@ def test_an_arm_that_gives_on_the_board_is_not_the_simulations_own_error(cache):
     (finding,) = result.verdict.findings
     assert finding.size > 1.5 and result.verdict.own_error < 0.04
 
+def test_a_food_half_as_stiff_is_followed_to_its_stiffness(cache):
+    protocol = load_protocol(str(resource_path("calibration/protocols/rich.yaml")))
+    chosen = ("press", "press_fast", "draw_1")
+    protocol.conditions = [c for c in protocol.conditions if c.label in chosen]
+    session = Session(protocol, [make_effect("stiffness:0.45")], seed=67, settings=WORLD)
+    records = [session.record(k) for k in range(len(session))]
+    setup = setup_of_food(CalibratedFood(food=protocol.food, knife=protocol.knife), REFINEMENT)
+    result = diagnose(setup, records, cache=cache, replicates=REPLICATES, workers=1)
+    assert result.verdict.kind == "nothing"
+    assert result.shifts["material.youngs_modulus"][0] == pytest.approx(0.55, rel=0.15)
+    material = result.extended().food.material
+    assert material.youngs_modulus == pytest.approx(
+        protocol.food.material.youngs_modulus * result.shifts["material.youngs_modulus"][0]
+    )
+
+
 
 @pytest.mark.parametrize(
     ("effect", "seed", "cause"),

@@ -14,6 +14,7 @@ from sliceit_drake.cutting.foods.known_error import KnownError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.at_size import AtSize
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Sensitivities
+from sliceit_drake.diagnosis.evidence.confirm import confirm
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
@@ -39,9 +40,9 @@ BASE = (
 """Base parameters of a calibrated food: a shift of theirs is reported as such."""
 MIN_RECORDS = 2
 FAR = 0.1
-"""Logarithm of a shift of a base parameter, two of the derivatives' steps: where more is needed and
-the verdict is unknown, records are judged once more by the food at these values."""
-MOVES = 4
+"""Logarithm of a shift of a base parameter, two of the derivatives' steps. Where more is needed and the
+verdict is unknown, simulations find the values, and records are judged once more from there."""
+MOVES = 3
 """Most times that they are."""
 
 
@@ -116,7 +117,9 @@ def diagnose(
         near = all(abs(np.log(factor)) < FAR for factor, _ in result.shifts.values())
         if near or result.verdict.names:
             break
-        there = {name: factors[name] * factor for name, (factor, _) in result.shifts.items()}
+        predictor = SlicePredictor(result.setup, records, cache=cache, workers=workers)
+        found = confirm(result.problem, predictor, [])
+        there = {name: factors[name] * factor for name, factor in found.factors.items()}
         moved, _ = extended_food(setup, there, [])
         again = judge(dc.replace(setup, food=moved.food), remarks)
         if again.verdict.misfit >= result.verdict.misfit:
