@@ -128,6 +128,8 @@ def test_an_arm_that_gives_on_the_board_is_not_the_simulations_own_error(cache):
     (finding,) = result.verdict.findings
     assert finding.size > 1.5 and result.verdict.own_error < 0.04
 
+
+@pytest.mark.second_tier
 def test_a_food_half_as_stiff_is_followed_to_its_stiffness(cache):
     protocol = load_protocol(str(resource_path("calibration/protocols/rich.yaml")))
     chosen = ("press", "press_fast", "draw_1")
@@ -142,7 +144,6 @@ def test_a_food_half_as_stiff_is_followed_to_its_stiffness(cache):
     assert material.youngs_modulus == pytest.approx(
         protocol.food.material.youngs_modulus * result.shifts["material.youngs_modulus"][0]
     )
-
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,10 @@ BASE = (
 """Base parameters of a calibrated food: a shift of theirs is reported as such."""
 MIN_RECORDS = 2
 FAR = 0.1
-"""Logarithm of a shift of a base parameter, two of the derivatives' steps. Where more is needed and the
-verdict is unknown, simulations find the values, and records are judged once more from there."""
+"""Logarithm of a shift of a base parameter, two of the derivatives' steps. Where more is needed and
+the verdict is unknown, simulations find the values, and records are judged from there."""
 MOVES = 3
-"""Most times that they are."""
+"""Most times that records are judged from other values."""
 
 
 def setup_of_food(
