@@ -140,6 +140,17 @@ def test_the_case_holds_disects_parameters_per_area():
     assert (material.toughness, material.strength) == pytest.approx((toughness, strength), rel=0.01)
 
 
+def test_springs_contact_and_board_keep_their_stiffness_per_area_in_another_material():
+    case = load_case("opening_alone")
+    other = disect.with_material(case, youngs_modulus=2.0 * case.food.material.youngs_modulus)
+
+    def per_area(case):
+        E, given = case.food.material.youngs_modulus, case.numerics
+        return E / given.flank_length, E * given.bond_stiffness, E * given.board_stiffness
+
+    assert per_area(other) == pytest.approx(per_area(case))
+
+
 def test_turning_a_body_strains_it_in_disect_as_was_found_there():
     assert disect.rotation_stress(0.0, 2.6e6, 0.37) == pytest.approx(0.0, abs=1e-6)
     assert disect.rotation_stress(math.radians(10.0), 2.6e6, 0.37) == pytest.approx(3.6e3, rel=0.02)

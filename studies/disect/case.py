@@ -351,10 +351,11 @@ def with_contact(case: Case, factor: float) -> Case:
 
 
 def with_material(case: Case, **values: float) -> Case:
-    """Other properties of the material; what `Numerics` gives in E/h stays the same in Pa/m."""
+    """Other properties of the material; what `Numerics` gives by way of E stays the same in Pa/m."""
     material = dc.replace(case.food.material, **values)
     ratio = case.food.material.youngs_modulus / material.youngs_modulus
-    return _rescaled(dc.replace(case, food=dc.replace(case.food, material=material)), ratio)
+    other = dc.replace(case, food=dc.replace(case.food, material=material))
+    return with_contact(_rescaled(other, ratio), ratio)
 
 
 def refined(case: Case, factor: int) -> Case:
