@@ -351,7 +351,7 @@ def with_contact(case: Case, factor: float) -> Case:
 
 
 def with_material(case: Case, **values: float) -> Case:
-    """Other properties of the material; what `Numerics` gives by way of E stays the same in Pa/m."""
+    """Other properties of the material; what `Numerics` gives in units of E stays in Pa/m."""
     material = dc.replace(case.food.material, **values)
     ratio = case.food.material.youngs_modulus / material.youngs_modulus
     other = dc.replace(case, food=dc.replace(case.food, material=material))
