@@ -409,6 +409,21 @@ def test_parameters_of_simulated_cuts_are_found_within_their_intervals():
     assert posterior.determined()["material.friction"]
 
 
+@pytest.mark.second_tier
+def test_slices_that_differ_in_strength_are_not_taken_for_a_model_that_lacks_something():
+    # Least squares moves each record's height by tenths of a millimetre to make up for it.
+    problem = Problem(speeds=(0.15,), records=3)
+    rng = np.random.default_rng(1)
+    truth = np.array([0.5, 0.45, 0.6, 0.45, 0.5, 0.55])
+    predictor, _ = synthetic_predictor(problem, truth, rng)
+    fit = gauss_newton(predictor, truth + [0.05, -0.08, 0.06, 0.05, -0.05, 0.05])
+    assert np.abs(fit.unit - truth)[3:].max() > 0.1
+    found = estimate(predictor, fit.unit)
+    assert not found.posterior.notes
+    assert np.abs(found.unit - truth)[3:].max() < 0.04
+    assert max(found.posterior.deviation[3:]) < 0.02
+
+
 def test_a_coverage_study_goes_on_from_its_file_and_refuses_that_of_another(tmp_path):
     problem, names = Problem(), ["material.friction", "height_offset:0-0"]
     done = [

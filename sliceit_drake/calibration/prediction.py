@@ -25,7 +25,7 @@ from sliceit_drake.prediction.simulator import Job, JobResult, Simulator
 from sliceit_drake.records.force_checks import flat_top
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["Parameter", "Prediction", "Predictor"]
+__all__ = ["HEIGHT", "Parameter", "Prediction", "Predictor"]
 
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""

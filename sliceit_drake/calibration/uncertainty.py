@@ -13,23 +13,30 @@ from sliceit_drake.calibration.gauss_newton import (
     linearise,
     residuals_at,
 )
-from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.prediction import HEIGHT, Predictor
 from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.foods.distribution import (
     DETERMINED,
     PRIOR_DEVIATION,
     ParameterDistribution,
 )
+from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel, NoiseProblem, group_series
 
 __all__ = ["Estimate", "Posterior", "estimate"]
 
-ROUNDS = 3
+ROUNDS = 6
 STEPS = 3
 SETTLED = 0.1
 """Largest move, in standard deviations, with which the alternation of noise and fit ends."""
 WORSE = 1.1
 """Error of the weighted fit over that of least squares from which on the noise is refuted."""
+USUAL = 0.1
+"""Relative standard deviation of the force between slices, before it is found."""
+HEIGHTS = 21
+"""Places within its range that each record's height is tried at."""
+SLICES = 2.0
+"""Standard deviations by which the force of a slice may be higher or lower than that of others."""
 AT_END = 5e-3
 """Part of a range within which a value is at its end."""
 CORRELATED = 0.9
@@ -158,8 +165,8 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     that are no noise, and such weights then give up the force for its changes. Where that costs
     much of the force, which the posterior notes, the estimate stays `unit`, with the covariance
     that it has under these residuals. From the predictions of the weighted fit what the sub-step
-    does wrong at `unit` is taken off. Beside what such a model lacks that is small, or, where
-    something snaps, so large that it is not the same near `unit`.
+    does wrong is taken off, where the fit begins and then where it ends. Beside what a model
+    lacks that is small, or, where something snaps, so large that it is not the same near `unit`.
 
     Args:
         unit: The fit of least squares [d].
@@ -169,21 +176,18 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         CuttingError: A slice breaks down near `unit`.
     """
     start = np.clip(unit, 0.0, 1.0)
-    usual, model = model, model.without_step_error(start)
-    at = first = linearise(model, start)
-    problem = _noise_problem(model, at)
-    noise = problem.fit()
-    for _ in range(rounds):
-        fit = gauss_newton(
-            model, at.unit, noise=noise, steps=STEPS, tolerance=1e-5, linearisation=at
-        )
-        moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(problem.covariance()))
-        at = _at_end(model, fit)
-        problem = _noise_problem(model, at)
-        noise = problem.fit(noise)
-        if moved.max() < SETTLED:
+    usual, first = model, linearise(model, start)
+    unknown = any(p.name.startswith(HEIGHT) for p in usual.parameters)
+    place = _among_heights(usual, start, rounds) if unknown and _repeated(usual) else start
+    for _ in range(2):
+        # Taken off anew where the fit ends, if that is elsewhere.
+        model = usual.without_step_error(place)
+        weighted = _weighted(model, place, rounds)
+        at, problem, noise = weighted.at, weighted.problem, weighted.noise
+        moved, place = at.unit - place, at.unit
+        if (np.abs(moved) < SETTLED * np.sqrt(np.diag(problem.covariance()))).all():
             break
-    errors = [float(np.sqrt(np.mean(x.residuals[model.used] ** 2))) for x in (first, at)]
+    errors = [_error(model, x, noise) for x in (first, at)]
     if errors[1] <= WORSE * errors[0]:
         posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise)
         return Estimate(at.unit, posterior, noise, problem.covariance())
@@ -203,6 +207,89 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     return Estimate(at.unit, posterior, noise, covariance)
 
 
+@dc.dataclass
+class _Weighted:
+    """A fit weighted with its noise: where it is, its noise, and how that was found."""
+
+    at: Linearisation
+    problem: NoiseProblem
+    noise: NoiseModel
+
+
+def _weighted(model: Predictor, start: np.ndarray, rounds: int) -> _Weighted:
+    """Fits parameters and noise in turn from a place [d]."""
+    at = linearise(model, start)
+    problem = _noise_problem(model, at)
+    noise = problem.fit()
+    for _ in range(rounds):
+        fit = gauss_newton(
+            model, at.unit, noise=noise, steps=STEPS, tolerance=1e-5, linearisation=at
+        )
+        moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(problem.covariance()))
+        at = _at_end(model, fit)
+        problem = _noise_problem(model, at)
+        noise = problem.fit(noise)
+        if moved.max() < SETTLED:
+            break
+    return _Weighted(at, problem, noise)
+
+
+def _repeated(model: Predictor) -> bool:
+    """Whether some cut was repeated, so that it shows how slices differ."""
+    named = [model.conditions[r] for r in np.unique(model.record_of[model.used])]
+    return len({n for n in named if n}) < len([n for n in named if n])
+
+
+def _among_heights(model: Predictor, start: np.ndarray, rounds: int) -> np.ndarray:
+    """Places [d] of the most probable of several weighted fits.
+
+    Least squares makes up with heights for what slices differ in, and waves of the force over the
+    elements may hold them there.
+    """
+    best = _weighted(model, start, rounds)
+    for place in (start, None):
+        try:
+            tried = _with_heights(model, best.at.unit if place is None else place)
+            best = min(best, _weighted(model, tried, rounds), key=lambda each: each.problem.cost)
+        except CuttingError:
+            # At these heights a slice breaks down: the fit from least squares stays.
+            continue
+    return best.at.unit
+
+
+def _with_heights(model: Predictor, unit: np.ndarray) -> np.ndarray:
+    """Places [d] with each record's height where its force fits best, were it as strong as it has
+    to be for that, within what is usual of slices."""
+    # In the order of the records.
+    own = [k for k, p in enumerate(model.parameters) if p.name.startswith(f"{HEIGHT}:")]
+    places = np.linspace(0.0, 1.0, HEIGHTS)
+    units = np.tile(unit, (HEIGHTS, 1))
+    units[:, own] = places[:, None]
+    out, reach = unit.copy(), SLICES * USUAL
+    found = residuals_at(model, list(units))
+    for record, k in enumerate(own):
+        rows = model.used & (model.record_of == record)
+        measured, errors = model.measured[rows], []
+        for residuals in found:
+            predicted = measured + residuals[rows]
+            factor = (predicted @ measured) / max(float(predicted @ predicted), 1e-12)
+            left = measured - np.clip(factor, 1.0 - reach, 1.0 + reach) * predicted
+            errors.append(float(left @ left))
+        if np.isfinite(errors).any():
+            out[k] = places[int(np.nanargmin(errors))]
+    return out
+
+
+def _error(model: Predictor, at: Linearisation, noise: NoiseModel) -> float:
+    """Error of a fit, N, once each slice is stronger or weaker than the others as slices are."""
+    left = at.residuals[model.used]
+    for scale in noise.scales[model.used].T:
+        reach = SLICES * (noise.record_scale or 0.0)
+        factor = (scale @ left) / max(float(scale @ scale), 1e-12)
+        left = left - np.clip(factor, -reach, reach) * scale
+    return float(np.sqrt(np.mean(left**2)))
+
+
 def _at_end(model: Predictor, fit: Fit) -> Linearisation:
     """The fit's linearisation, moved to its end: after a step that is small no new one is due."""
     at = fit.linearisation
@@ -219,10 +306,8 @@ def _noise_problem(model: Predictor, at: Linearisation) -> NoiseProblem:
     conditions = model.conditions
     channels = [part.shape[1] for part in model.split(measured)]
     present = np.unique(record_of[used])
-    named = [conditions[r] for r in present if conditions[r]]
-    replicated = len(set(named)) < len(named)
     predicted = np.where(used, at.residuals + measured, 0.0)
-    members = present if replicated else present[:0]
+    members = present if _repeated(model) else present[:0]
     return NoiseProblem(
         group_series(used, model.time, record_of, channels, conditions),
         at.residuals,

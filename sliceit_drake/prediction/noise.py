@@ -328,6 +328,11 @@ class NoiseProblem:
         scale = float(np.exp(self._numbers[-1])) if self._replicated else None
         return NoiseModel(self._groups, ar, tau, white, scale, self._scales)
 
+    @property
+    def cost(self) -> float:
+        """-2 log of the marginal likelihood of what was fitted, but for a constant."""
+        return self._objective(self._numbers)
+
     def covariance(self) -> np.ndarray:
         """Covariance of the parameters [d, d], if the noise were exactly what was fitted."""
         return self._estimate(self._numbers)[0]
