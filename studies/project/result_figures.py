@@ -63,6 +63,7 @@ def coverage_figure() -> Figure:
             axes.plot(e, row, ".", color=BLUE if abs(e) <= h else RED)
         axes.axvline(0.0, color="k", lw=0.8)
         axes.set(xlabel="found minus true [of the range]", yticks=[])
+        axes.xaxis.set_major_locator(MaxNLocator(4))
         tidy(axes, shared[k].removeprefix("material."))
     figure.axes[0].set_ylabel(f"{len(replicates)} replicates")
     return figure
