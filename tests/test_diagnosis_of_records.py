@@ -140,6 +140,7 @@ def test_a_food_half_as_stiff_is_followed_to_its_stiffness(cache):
     result = diagnose(setup, records, cache=cache, replicates=REPLICATES, workers=1)
     assert result.verdict.kind == "nothing"
     assert result.shifts["material.youngs_modulus"][0] == pytest.approx(0.55, rel=0.15)
+    assert result.sentence().startswith("With its youngs modulus times 0.5")
     material = result.extended().food.material
     assert material.youngs_modulus == pytest.approx(
         protocol.food.material.youngs_modulus * result.shifts["material.youngs_modulus"][0]

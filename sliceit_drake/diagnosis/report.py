@@ -61,6 +61,8 @@ MEASURED, PREDICTED, EXTENDED = "#111827", "#2563eb", "#c2410c"
 SHOWN = 8
 CALM = 0.3
 """Jump of the prediction, N, near which what is left does not set the scale of a plot."""
+SHIFT = 0.1
+"""Logarithm of a shift of a base parameter from which on the first sentence names it."""
 
 
 class Result(Protocol):
@@ -71,6 +73,7 @@ class Result(Protocol):
     causes: dict[str, Cause]
     gain: HeldOutGain | None
     extension: LinearProblem | None
+    shifts: dict[str, tuple[float, float]]
 
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""
@@ -313,9 +316,15 @@ def sentence(result: Result) -> str:
     where += f", of {record.condition or record.name}"
     names = " and ".join(name for name, _ in verdict.named)
     if verdict.kind == "nothing":
+        moved = [
+            f"{name.rpartition('.')[2].replace('_', ' ')} times {factor:.2f}"
+            for name, (factor, error) in result.shifts.items()
+            if abs(np.log(factor)) > max(SHIFT, 2.0 * error)
+        ]
+        so = f"With its {', '.join(moved)} the" if moved else "The"
         return (
-            "The simulation is as close to these records as noise and slices that differ allow to"
-            " tell."
+            f"{so} simulation is as close to these records as noise and slices that differ allow"
+            " to tell."
         )
     if verdict.trend is not None and not names:
         channel = CHANNELS[verdict.trend.channel]
