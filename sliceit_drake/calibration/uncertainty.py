@@ -176,7 +176,7 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         CuttingError: A slice breaks down near `unit`.
     """
     start = np.clip(unit, 0.0, 1.0)
-    usual, first = model, linearise(model, start)
+    usual, (first,) = model, residuals_at(model, [start])
     unknown = any(p.name.startswith(HEIGHT) for p in usual.parameters)
     place = _among_heights(usual, start, rounds) if unknown and _repeated(usual) else start
     for _ in range(2):
@@ -187,7 +187,7 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         moved, place = at.unit - place, at.unit
         if (np.abs(moved) < SETTLED * np.sqrt(np.diag(problem.covariance()))).all():
             break
-    errors = [_error(model, x, noise) for x in (first, at)]
+    errors = [_error(model, x, noise) for x in (first, at.residuals)]
     if errors[1] <= WORSE * errors[0]:
         posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise)
         return Estimate(at.unit, posterior, noise, problem.covariance())
@@ -246,15 +246,16 @@ def _among_heights(model: Predictor, start: np.ndarray, rounds: int) -> np.ndarr
     Least squares makes up with heights for what slices differ in, and waves of the force over the
     elements may hold them there.
     """
-    best = _weighted(model, start, rounds)
-    for place in (start, None):
+    best, place = _weighted(model, start, rounds), start
+    for _ in range(2):
         try:
-            tried = _with_heights(model, best.at.unit if place is None else place)
-            best = min(best, _weighted(model, tried, rounds), key=lambda each: each.problem.cost)
+            other = _weighted(model, _with_heights(model, place), rounds)
+            best = min(best, other, key=lambda each: each.problem.cost)
         except CuttingError:
-            # At these heights a slice breaks down: the fit from least squares stays.
-            continue
-    return best.at.unit
+            # At these heights a slice breaks down: the best so far stays.
+            pass
+        place = best.at.unit
+    return place
 
 
 def _with_heights(model: Predictor, unit: np.ndarray) -> np.ndarray:
@@ -280,9 +281,9 @@ def _with_heights(model: Predictor, unit: np.ndarray) -> np.ndarray:
     return out
 
 
-def _error(model: Predictor, at: Linearisation, noise: NoiseModel) -> float:
-    """Error of a fit, N, once each slice is stronger or weaker than the others as slices are."""
-    left = at.residuals[model.used]
+def _error(model: Predictor, residuals: np.ndarray, noise: NoiseModel) -> float:
+    """Error of a fit with residuals [M], N, once each slice is as strong as slices may be."""
+    left = residuals[model.used]
     for scale in noise.scales[model.used].T:
         reach = SLICES * (noise.record_scale or 0.0)
         factor = (scale @ left) / max(float(scale @ scale), 1e-12)
