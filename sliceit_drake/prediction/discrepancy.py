@@ -18,14 +18,13 @@ Woodbury's identity: with Gram matrices G = [X Z]' N^-1 [X Z] of columns X and s
 coefficients of variance D leave G - G[:, Z] (G[Z, Z] + D^-1)^-1 G[Z, :].
 """
 
-import copy
 import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri, dtrtrs
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 
 __all__ = [
     "LESS",
@@ -46,6 +45,8 @@ PHASES = ("in", "rest", "out", "again", "board", "any")
 anywhere, in the air as well: a cable, a hose or a joint pulls with where the arm is, and unlike a
 sensor that drifts no more where the arm is back."""
 PARTS = ("shared", "speed", "draw", "condition")
+FIRST, SECOND = np.triu_indices(3)
+"""Pairs of the parts that conditions share."""
 SHAPES = {"in": 10, "out": 5, "again": 5}
 """Number of shapes of a phase."""
 ENTRY = 3e-3
@@ -206,55 +207,62 @@ class Weighted:
     """Moments in which a discrepancy of certain sizes is integrated out.
 
     Attributes:
-        total: Gram matrix of the columns without the discrepancy, all conditions together [n, n].
+        order: Numbers of the shapes' columns and of the others that are looked at, all by default.
+        total: Gram matrix of the latter without the discrepancy, all conditions together [n, n].
         log_det: Logarithm of the determinant of what was integrated out.
     """
 
-    def __init__(self, problem: "Discrepancy", grams: Sequence[np.ndarray], sizes: Sizes) -> None:
+    def __init__(
+        self,
+        problem: "Discrepancy",
+        grams: Sequence[np.ndarray],
+        sizes: Sizes,
+        others: Sequence[int] | None = None,
+    ) -> None:
         self.problem = problem
-        Z, X = problem.shapes, problem.others
-        n, z = len(X), len(Z)
+        self.order = [*problem.shapes, *(problem.others if others is None else others)]
+        G = np.array([gram[np.ix_(self.order, self.order)] for gram in grams])
+        z, N = len(problem.shapes), len(self.order)
         self.deviations = sizes.deviations(problem.channel, problem.phase)
-        D, G = self.deviations[3], np.array(grams)
+        D = self.deviations[3]
         self.scales = [of[:, None] * self.deviations[:3] for of in problem.factors]
-        GZ = D[:, None] * G[:, Z]
-        self.roots = np.linalg.cholesky(np.eye(z) + GZ[:, :, Z] * D)
+        GZ = D[:, None] * G[:, :z]
+        self.roots = np.linalg.cholesky(np.eye(z) + GZ[:, :, :z] * D)
         self.log_det = 2.0 * float(np.log(np.diagonal(self.roots, 0, 1, 2)).sum())
-        self.solved = np.array(
-            [dtrtrs(L, B, lower=1)[0] for L, B in zip(self.roots, GZ, strict=True)]
-        )
-        self.of_condition = G - self.solved.transpose(0, 2, 1) @ self.solved
+        self.solved = [dtrtrs(L, B, lower=1)[0] for L, B in zip(self.roots, GZ, strict=True)]
+        for A, S in zip(G, self.solved, strict=True):
+            A -= S.T @ S
+        self.of_condition = G
         # What all conditions share goes by their factors, and by the deviations alike in all.
-        F, wide = np.array(problem.factors), self.deviations[:3].ravel()
-        A = self.of_condition.reshape(len(G), -1)
-        N = G.shape[1]
-        pairs = ((F[:, :, None] * F[:, None]).reshape(len(G), 9).T @ A).reshape(3, 3, N, N)
-        single = (F.T @ A).reshape(3, N, N)
-        shared = np.zeros((3 * z + n, 3 * z + n))
-        among = pairs[:, :, Z][:, :, :, Z].transpose(0, 2, 1, 3).reshape(3 * z, 3 * z)
-        shared[: 3 * z, : 3 * z] = wide[:, None] * among * wide
-        shared[: 3 * z, 3 * z :] = wide[:, None] * single[:, Z][:, :, X].reshape(3 * z, n)
-        shared[3 * z :, 3 * z :] = self.of_condition.sum(0)[np.ix_(X, X)]
-        shared[3 * z :, : 3 * z] = shared[: 3 * z, 3 * z :].T
-        self.shared, self.size = shared, 3 * z
-        inner = np.eye(3 * z) + shared[: 3 * z, : 3 * z]
-        inner[np.diag_indices(3 * z)] *= 1.0 + JITTER
-        self.factor = cho_factor(inner, lower=True, check_finite=False)
+        F, wide, s = np.array(problem.factors), self.deviations[:3], 3 * z
+        shared = np.zeros((s + N - z, s + N - z))
+        among = shared[:s, :s].reshape(3, z, 3, z)
+        pairs = (F[:, FIRST] * F[:, SECOND]).T @ G[:, :z, :z].reshape(len(G), -1)
+        for a, b, pair in zip(FIRST, SECOND, pairs.reshape(-1, z, z), strict=True):
+            among[a, :, b] = wide[a][:, None] * pair * wide[b]
+            among[b, :, a] = among[a, :, b].T
+        single = (F.T @ G[:, :z, z:].reshape(len(G), -1)).reshape(3, z, -1)
+        shared[:s, s:] = (wide[:, :, None] * single).reshape(s, -1)
+        shared[s:, s:] = G[:, z:, z:].sum(0)
+        self.shared, self.size = shared, s
+        inner = shared[:s, :s].copy()
+        inner[np.diag_indices(s)] = (1.0 + np.diag(inner)) * (1.0 + JITTER)
+        self.factor = cho_factor(inner, lower=True, overwrite_a=True, check_finite=False)
         self.log_det += 2.0 * float(np.log(np.diag(self.factor[0])).sum())
-        right = shared[: 3 * z, 3 * z :]
-        self.total = shared[3 * z :, 3 * z :] - right.T @ cho_solve(self.factor, right)
+        right = shared[:s, s:]
+        self.total = shared[s:, s:] - right.T @ cho_solve(self.factor, right, check_finite=False)
 
     def products(self, columns: np.ndarray) -> list[np.ndarray]:
         """Products of each coefficient of the discrepancy, over its standard deviation, with
         combinations of the columns [n, k]: of the shared ones, of speed and draw [3 z, k], and of
         each condition [z, k], in a list."""
-        Z, X, s = self.problem.shapes, self.problem.others, self.size
+        z, s = len(self.problem.shapes), self.size
         right = self.shared[:s, s:] @ columns
         fitted = cho_solve(self.factor, right, check_finite=False)
         out = [right - self.shared[:s, :s] @ fitted]
         for A, scale in zip(self.of_condition, self.scales, strict=True):
-            back = scale[:, :, None] * fitted.reshape(3, len(Z), -1)
-            left = A[np.ix_(Z, X)] @ columns - A[np.ix_(Z, Z)] @ back.sum(0)
+            back = scale[:, :, None] * fitted.reshape(3, z, -1)
+            left = A[:z, z:] @ columns - A[:z, :z] @ back.sum(0)
             out.append(self.deviations[3][:, None] * left)
         return out
 
@@ -284,28 +292,36 @@ class Weighted:
         Returns:
             [e, k].
         """
-        Z, X, s = self.problem.shapes, self.problem.others, self.size
+        z, s = len(self.problem.shapes), self.size
         D, L = self.deviations[3], self.roots[condition]
         weights = D[:, None] * dtrtrs(L, self.solved[condition], lower=1, trans=1)[0]
-        left = rows - rows[:, Z] @ weights
-        scaled = np.tile(left[:, Z], 3) * self.scales[condition].ravel()
+        left = rows[:, self.order]
+        left = left - left[:, :z] @ weights
+        scaled = np.tile(left[:, :z], 3) * self.scales[condition].ravel()
         fitted = cho_solve(self.factor, self.shared[:s, s:] @ columns, check_finite=False)
-        return np.asarray(left[:, X] @ columns - scaled @ fitted)
+        return np.asarray(left[:, z:] @ columns - scaled @ fitted)
 
     def traces(self) -> list[np.ndarray]:
         """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
         `products` but with nothing else projected out."""
-        Z, D = self.problem.shapes, self.deviations[3]
+        z, D, wide = len(self.problem.shapes), self.deviations[3], self.deviations[:3]
         # With P the inverse of E + B, E nearly 1, B - B P B has the diagonal of E - E P E.
         P, _ = dpotri(self.factor[0], lower=1)
-        P = np.tril(P) + np.tril(P, -1).T
         E = 1.0 + JITTER * (1.0 + np.diag(self.shared)[: self.size])
         out = [E - E * np.diag(P) * E]
-        blocks = P.reshape(3, len(Z), 3, len(Z))
-        for A, scale in zip(self.of_condition, self.scales, strict=True):
-            ZZ = A[np.ix_(Z, Z)] * D
-            among = np.einsum("az,azby,by->zy", scale, blocks, scale, optimize=True)
-            out.append(D * np.diag(ZZ) - np.einsum("ij,ij->j", ZZ, among @ ZZ))
+        blocks = P.reshape(3, z, 3, z)
+        pairs = np.empty((len(FIRST), z, z))
+        for pair, a, b in zip(pairs, FIRST, SECOND, strict=True):
+            # Of what is on the diagonal the lower triangle alone is there, and counts twice.
+            lower = np.tril(blocks[a, :, a]) if a == b else blocks[b, :, a]
+            pair[:] = wide[b][:, None] * lower * wide[a]
+        pairs[FIRST == SECOND] *= 1.0 - 0.5 * np.eye(z)
+        F = np.array(self.problem.factors)
+        among = (F[:, FIRST] * F[:, SECOND]) @ pairs.reshape(len(pairs), -1)
+        ZZ = self.of_condition[:, :z, :z]
+        products = among.reshape(len(F), z, z) @ (ZZ * D)
+        for A, product in zip(ZZ, products, strict=True):
+            out.append(D * D * np.diag(A) - 2.0 * D * (A * product).sum(0))
         return out
 
 
@@ -362,7 +378,7 @@ class Discrepancy:
             fitted: Columns that are fitted, as numbers in `others` [k].
             prior: Precisions of their coefficients; 0 where nothing is known [k].
         """
-        W = self._weighted(grams, sizes, fitted)
+        W = Weighted(self, grams, sizes, [*(self.others[k] for k in fitted), self.others[-1]])
         T, y = W.total, len(fitted)
         inner = T[:y, :y] + np.diag(prior)
         scale = np.sqrt(np.maximum(np.diag(inner), 1e-30))
@@ -386,16 +402,6 @@ class Discrepancy:
         gradient = self._by_size(by_shape)
         away = (sizes.flat - self.prior.flat) / self.spread
         return value - 0.5 * float(away @ away), gradient - away / self.spread
-
-    def _weighted(
-        self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int]
-    ) -> Weighted:
-        """Moments of the fitted columns and the residual alone, in this order."""
-        z = len(self.shapes)
-        kept = [*self.shapes, *(self.others[k] for k in fitted), self.others[-1]]
-        some = copy.copy(self)
-        some.shapes, some.others = list(range(z)), list(range(z, len(kept)))
-        return Weighted(some, [G[np.ix_(kept, kept)] for G in grams], sizes)
 
     def _by_size(self, by_shape: np.ndarray) -> np.ndarray:
         """Sums of what belongs to shapes [4, z] by the size that it belongs to."""
@@ -425,23 +431,40 @@ class Discrepancy:
         prior: np.ndarray,
         start: Sizes | None = None,
         tolerance: float = 1e-2,
+        covariance: np.ndarray | None = None,
     ) -> tuple[Sizes, float]:
-        """Sizes of largest likelihood and prior, and its logarithm; see `likelihood`."""
+        """Sizes of largest likelihood and prior, and its logarithm; see `likelihood`.
 
-        def objective(flat: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient = self.likelihood(grams, Sizes.of(flat), fitted, prior)
-            return -value, -gradient
-
+        Args:
+            grams, fitted, prior: As for `likelihood`.
+            start: Where the search begins; the prior's medians by default.
+            tolerance: Of the gradient.
+            covariance: About that of the logarithms of the sizes: in its units a search takes a
+                third of the evaluations.
+        """
         first = (start or self.prior).flat
-        near = [
-            (m - 5.0 * s, m + 3.0 * s) for m, s in zip(self.prior.flat, self.spread, strict=True)
-        ]
-        found = minimize(
-            objective,
-            first,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=near,
-            options={"ftol": 1e-12, "gtol": tolerance, "maxiter": 60},
-        )
-        return Sizes.of(found.x), -float(found.fun)
+        ends = self.prior.flat - 5.0 * self.spread, self.prior.flat + 3.0 * self.spread
+
+        def least(root: np.ndarray, bounds: Bounds | None) -> tuple[np.ndarray, float]:
+            def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+                sizes = Sizes.of(first + root @ x)
+                value, gradient = self.likelihood(grams, sizes, fitted, prior)
+                return -value, -root.T @ gradient
+
+            found = minimize(
+                objective,
+                np.zeros(len(first)),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=bounds,
+                options={"ftol": 1e-12, "gtol": tolerance, "maxiter": 60},
+            )
+            return first + root @ found.x, -float(found.fun)
+
+        if covariance is not None:
+            flat, value = least(np.linalg.cholesky(covariance), None)
+            if (flat >= ends[0]).all() and (flat <= ends[1]).all():
+                return Sizes.of(flat), value
+            first = np.clip(flat, *ends)
+        flat, value = least(np.eye(len(first)), Bounds(ends[0] - first, ends[1] - first))
+        return Sizes.of(flat), value

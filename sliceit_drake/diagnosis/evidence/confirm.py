@@ -142,7 +142,9 @@ def _corrected(
     ]
     # Made anew: where a force jumps is where the simulation now has it.
     found = dc.replace(moved.found, records=records)
-    return LinearProblem(found, *moved.slice_levels)
+    out = LinearProblem(found, *moved.slice_levels)
+    out.near = moved.near
+    return out
 
 
 def _fit(problem: LinearProblem, columns: list[int], causes: list[int]) -> tuple[np.ndarray, float]:

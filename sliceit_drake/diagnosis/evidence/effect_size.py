@@ -72,19 +72,16 @@ class OwnError:
         Of what was found or of what the sizes let it be, whichever is more: a part of it may have
         been taken for a cause. With `found` of what was found alone.
         """
-        records, model = self.problem.found.records, self.problem.discrepancy
+        model = self.problem.discrepancy
         deviations = self.sizes.deviations(model.channel, model.phase)
         usual = []
         for r, values in enumerate(self.problem.shape_values):
             factors = np.append(model.factors[self.problem.condition_of[r]], 1.0)
             by_shape = ((factors[:, None] * deviations) ** 2).sum(0)
             usual.append((not found) * values**2 @ by_shape.reshape(len(self.problem.noise), -1).T)
-        labels = np.concatenate([r.phase.astype(str) for r in records])
-        touching = np.concatenate([r.in_contact for r in records])
         squares = np.concatenate(self.values) ** 2, np.concatenate(usual)
         out = np.zeros_like(squares[0])
-        for label in np.unique(labels[touching]):
-            rows = touching & (labels == label)
+        for rows in self.problem.rows_by_phase:
             out[rows] = np.sqrt(np.maximum(*(of[rows].mean(0) for of in squares)))
         return np.split(out, np.cumsum([len(v) for v in usual])[:-1])
 
@@ -181,12 +178,13 @@ def size_by_record(
         problem.shape_values,
         problem.levels[problem.condition_of],
         problem.scales,
+        problem.errors,
         coefficients,
         strict=True,
     )
-    for record, shapes, level, scale, g in records:
+    for record, shapes, level, scale, error, g in records:
         uneven = (level[:, None] * of_slice) ** 2
-        effect, error = record.columns[:, :, own] @ g, problem.model_error(record)
+        effect = record.columns[:, :, own] @ g
         effects.append((effect / scale).ravel())
         X = np.concatenate([record.columns[:, :, base], effect[:, :, None]], axis=2).astype(float)
         for c, noise in enumerate(problem.noise):
@@ -210,11 +208,8 @@ def _scales(
     included where one is given, each [m, c]."""
     if wrong is None:
         return problem.scales
-    scales = zip(problem.found.records, wrong.scales(found), strict=True)
-    return [
-        np.sqrt(own**2 + problem.noise_of(r) ** 2 + problem.model_error(r) ** 2)
-        for r, own in scales
-    ]
+    scales = zip(problem.variances, wrong.scales(found), strict=True)
+    return [np.sqrt(own**2 + variance) for variance, own in scales]
 
 
 def _acts(effect: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import copy
 import dataclasses as dc
 import functools
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -82,7 +83,9 @@ LITTLE = 0.1
 BETTER = 20.0
 """Twice the logarithm of the likelihood by which slices that are uneven have to be likelier."""
 KEPT = 4
-"""Sets of reduced Gram matrices that are kept."""
+"""Sets of reduced Gram matrices that are kept, and of those without a discrepancy."""
+THREADS = 2
+"""That make the moments of records."""
 
 
 @dc.dataclass
@@ -147,6 +150,8 @@ class LinearProblem:
             simulation is known from other slices, how these differed counts as well.
         levels: By which slices of a condition differ more or less than others, by channel [C, c].
         variation_samples: Number of independent differences that they were estimated from.
+        near: Sizes of a problem like this one, with their `uncertainty`: the search for this one's
+            begins there.
     """
 
     def __init__(
@@ -171,13 +176,16 @@ class LinearProblem:
         self.condition_of = [of[r] for r in range(len(found.records))]
         self.usual, self.usual_own = self._usual()
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
+        self._weighted: dict[tuple[tuple[int, ...], bytes, bytes], Weighted] = {}
         self._fits: dict[tuple[int, ...], tuple[Sizes, float]] = {}
+        self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
+        self.near: tuple[Sizes, np.ndarray] | None = None
         self._make_shapes()
         # In the air slices do not differ.
         cut = [g for g in self.conditions.values() if found.records[g[0]].in_contact.any()]
         self._cut = [r for g in cut for r in g]
         self.variation_samples = len(self._cut) - len(cut)
-        self._errors = [self.model_error(r) for r in found.records]
+        self._errors = self.errors
         self.uneven = np.zeros(len(self.shapes)) if uneven is None else uneven
         if noise is None:
             self.noise, self.repeated = self._estimate_noise(found.records, False)
@@ -265,7 +273,8 @@ class LinearProblem:
     def _make_moments(self) -> None:
         found = self.found
         self._calm = [self.calm(r) for r in found.records]
-        grams = [self._moments_of(number) for number in range(len(found.records))]
+        with ThreadPoolExecutor(THREADS) as pool:
+            grams = list(pool.map(self._moments_of, range(len(found.records))))
         self.moments = Moments(*map(np.array, zip(*grams, strict=True)))
 
     def _parts(
@@ -325,7 +334,27 @@ class LinearProblem:
     @functools.cached_property
     def scales(self) -> list[np.ndarray]:
         """The noise with `model_error` at the rows of each record, each [m, c]."""
-        return [np.hypot(self.apart_by(r), self.model_error(r)) for r in self.found.records]
+        records = zip(self.found.records, self.errors, strict=True)
+        return [np.hypot(self.apart_by(r), error) for r, error in records]
+
+    @functools.cached_property
+    def errors(self) -> list[np.ndarray]:
+        """`model_error` of each record, each [m, c]."""
+        return [self.model_error(r) for r in self.found.records]
+
+    @functools.cached_property
+    def variances(self) -> list[np.ndarray]:
+        """Of the noise and of what the model is unsure of at the rows of each record [m, c]."""
+        records = zip(self.found.records, self.errors, strict=True)
+        return [self.noise_of(r) ** 2 + error**2 for r, error in records]
+
+    @functools.cached_property
+    def rows_by_phase(self) -> list[np.ndarray]:
+        """Rows of all records together at which the knife touches, for each phase of the motion."""
+        records = self.found.records
+        labels = np.concatenate([r.phase.astype(str) for r in records])
+        touching = np.concatenate([r.in_contact for r in records])
+        return [np.flatnonzero(touching & (labels == p)) for p in np.unique(labels[touching])]
 
     def apart_by(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation at each row by which slices that are cut alike differ, beside what
@@ -344,7 +373,7 @@ class LinearProblem:
             coefficients: Of the columns in each record [R, n].
         """
         out = copy.copy(self)
-        vars(out).pop("scales", None)
+        out._forget("scales", "variances")
         records = [
             dc.replace(r, predicted=r.predicted + r.columns[:, :, list(columns)] @ g)
             for r, g in zip(self.found.records, coefficients, strict=True)
@@ -374,14 +403,15 @@ class LinearProblem:
     ) -> "LinearProblem":
         """Of records that differ in these columns alone; the residual is the last column."""
         out = copy.copy(self)
-        out._reduced = {}
-        for kept in ("apart", "scales"):
-            vars(out).pop(kept, None)
+        out._forget("apart", "scales", "errors", "variances")
+        out._reduced, out._weighted = {}, {}
+        if () in self._fits:
+            out.near = self.sizes, self.uncertainty()
         of_all = {*self.baseline, *self.own, *self.usual_own, self.size}
         seen = set(changed)
-        out._fits = (
-            {} if seen & of_all else {k: f for k, f in self._fits.items() if not seen & {*k}}
-        )
+        kept = [k for k in self._fits if not (seen & {*k} or seen & of_all)]
+        out._fits = {k: self._fits[k] for k in kept}
+        out._uncertain = {k: self._uncertain[k] for k in kept if k in self._uncertain}
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
         for r, now in enumerate(records):
             both = self._products_of(r, now, changed)
@@ -390,6 +420,11 @@ class LinearProblem:
         out.found = dc.replace(self.found, records=list(records))
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
+
+    def _forget(self, *names: str) -> None:
+        """Of a copy: cached properties of what it was copied from."""
+        for name in names:
+            vars(self).pop(name, None)
 
     @functools.cached_property
     def apart(self) -> "LinearProblem":
@@ -437,12 +472,32 @@ class LinearProblem:
         restricted likelihood with the prior."""
         key = tuple(causes)
         if key not in self._fits:
+            near = self.near
+            if near is None and causes:
+                near = self.sizes, self.uncertainty()
+            first, covariance = near or (None, None)
             model = self.with_causes(causes)
-            grams = self.by_condition(model)
-            prior = model.prior[model.shared]
-            sizes, value = self.discrepancy.fit(grams, model.shared, prior, start, TOLERANCE)
+            sizes, value = self.discrepancy.fit(
+                self.by_condition(model),
+                model.shared,
+                model.prior[model.shared],
+                start or first,
+                TOLERANCE,
+                covariance,
+            )
             self._fits[key] = sizes, value - 0.5 * self.own_log_det(model)
         return self._fits[key]
+
+    def uncertainty(self, causes: Sequence[int] = ()) -> np.ndarray:
+        """Covariance of the logarithms of the sizes with columns of causes in the model."""
+        key = tuple(causes)
+        if key not in self._uncertain:
+            sizes, _ = self.fitted_sizes(causes)
+            model = self.with_causes(causes)
+            self._uncertain[key] = self.discrepancy.uncertain(
+                self.by_condition(model), sizes, model.shared, model.prior[model.shared]
+            )
+        return self._uncertain[key]
 
     def with_causes(self, causes: Sequence[int] = (), unusual: Sequence[int] = ()) -> Model:
         """The model with columns of causes, their coefficients normal with a standard deviation of
@@ -473,8 +528,15 @@ class LinearProblem:
     ) -> Weighted:
         """Moments with what is each record's own and the discrepancy integrated out; one record may
         be left out."""
-        grams = self.by_condition(model, without)
-        return Weighted(self.discrepancy, grams, self.sizes if sizes is None else sizes)
+        sizes = self.sizes if sizes is None else sizes
+        if without is not None:
+            return Weighted(self.discrepancy, self.by_condition(model, without), sizes)
+        key = tuple(model.own), model.variance.tobytes(), sizes.flat.tobytes()
+        if key not in self._weighted:
+            if len(self._weighted) > KEPT:
+                self._weighted.clear()
+            self._weighted[key] = Weighted(self.discrepancy, self.by_condition(model), sizes)
+        return self._weighted[key]
 
     @property
     def baseline(self) -> list[int]:

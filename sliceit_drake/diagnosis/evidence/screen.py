@@ -167,7 +167,6 @@ class _Statistics:
         }
         self.names = list(dict.fromkeys(name for name, _ in self.options))
         self.model = problem.with_causes(self.taken)
-        self.grams = problem.by_condition(self.model)
         self.sizes, self.value = problem.fitted_sizes(self.taken)
         self.weighted = problem.weighted(self.model, self.sizes)
         T, F = self.weighted.total, self.model.shared
@@ -255,10 +254,7 @@ class _Chance:
         rest = A - self.of_sizes.T @ self.of_sizes - self.of_own.T @ self.of_own
         values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
         self.root = vectors * np.sqrt(np.maximum(values, 0.0))
-        model = statistics.model
-        self.covariance = problem.discrepancy.uncertain(
-            statistics.grams, statistics.sizes, model.shared, model.prior[model.shared]
-        )
+        self.covariance = problem.uncertainty(statistics.taken)
 
     def __call__(self, number: int) -> np.ndarray:
         """Draws some [number, K]."""
