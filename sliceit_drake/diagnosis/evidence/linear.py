@@ -295,6 +295,9 @@ class LinearProblem:
         force_gram = np.zeros_like(gram)
         error, calm = self._errors[number], self._calm[number]
         for c, at, X in self._parts(record, shapes):
+            # Many causes change few channels.
+            changed = X.any(0)
+            at, X = at[changed], X[:, changed]
             G = X.T @ self.noise[c].solve(record.time, X, error[:, c], record.near)
             gram[np.ix_(at, at)] += 0.5 * (G + G.T)
             if c in self.forces:

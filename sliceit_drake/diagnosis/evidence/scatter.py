@@ -11,7 +11,7 @@ degrees of freedom are those of Satterthwaite (1946).
 import dataclasses as dc
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared, wider
@@ -48,7 +48,7 @@ class Scatter:
             return 1.0
         of_log = -0.5 * self.freedom * (np.log(FACTORS) + self.factor / FACTORS)
         weights = np.exp(of_log - of_log.max())
-        return float(weights @ chi2.sf(gain / FACTORS, numbers) / weights.sum())
+        return float(weights @ chdtrc(numbers, gain / FACTORS) / weights.sum())
 
 
 def scatter_of_replicates(
