@@ -63,8 +63,8 @@ def build(folder: Path) -> tuple[Path, Path]:
     return source, wheel
 
 
-def first_run(folder: Path) -> dict[str, float]:
-    """Times of the stages, s, and sizes, B."""
+def first_run(folder: Path, python: str) -> dict[str, float]:
+    """Times of the stages, s, and sizes, B, with this Python."""
     source, wheel = build(folder)
     home, work, venv = folder / "home", folder / "a folder", folder / "venv"
     home.mkdir()
@@ -73,7 +73,7 @@ def first_run(folder: Path) -> dict[str, float]:
         "sdist_bytes": source.stat().st_size,
         "wheel_bytes": wheel.stat().st_size,
     }
-    values["environment_s"], _ = call([sys.executable, "-m", "venv", str(venv)])
+    values["environment_s"], _ = call([python, "-m", "venv", str(venv)])
     pip = [str(venv / "bin" / "python"), "-m", "pip", "install", "-q"]
     values["install_s"], _ = call([*pip, "-c", str(ROOT / "constraints.txt"), str(wheel)])
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(home)}
@@ -95,13 +95,16 @@ def first_run(folder: Path) -> dict[str, float]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
+    parser.add_argument(
+        "--python", default=sys.executable, help="that the wheel is installed for (default: this)"
+    )
     add_json_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     with tempfile.TemporaryDirectory() as folder:
-        values = first_run(Path(folder))
+        values = first_run(Path(folder), options.python)
     for name, value in values.items():
         print(f"{name}: {value:.4g}")
     write_results(options, values)
