@@ -26,7 +26,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         (
             "explanation/diagnosis",
             f"a channel's size is {100 * discrepancy.USUAL_SHARE:g} % of the force, up or down by "
-            f"a factor of e^{discrepancy.PRIOR['channel']:g}",
+            f"a factor of $e^{{{discrepancy.PRIOR['channel']:g}}}$",
         ),
         (
             "how_to/next_experiment",
