@@ -141,7 +141,7 @@ def judge(
         case=case,
         verdict=verdict,
         classes=named,
-        right=_is_right(case.kind, verdict, named, truth, wrong, near_by),
+        right=_is_right(case.kind, verdict, named, truth, allowed, near_by),
         wrong=wrong,
         gain=None if gain is None else float(gain["share_removed"]),
         oracle=None if oracle is None else float(oracle),
@@ -156,7 +156,7 @@ def _is_right(
     verdict: str,
     named: list[list[str]],
     truth: list[str],
-    wrong: list[str],
+    allowed: set[str],
     near_by: list[list[str]],
 ) -> bool:
     if kind in ("nothing", "base"):
@@ -168,11 +168,15 @@ def _is_right(
             return False
         (a, b), (first, second) = truth, named
         return (a in first and b in second) or (a in second and b in first)
-    if verdict == "unknown" and truth[0] in LOCKED_TO_DEPTH:
-        # "Which may be its law as well as shape, core or skin": no records tell these apart.
-        return len(near_by) == 1 and {truth[0], LAW} <= set(near_by[0])
+    if verdict == "unknown" and (truth[0] in LOCKED_TO_DEPTH or kind == "poor"):
+        # "Which may be its law as well as shape, core or skin": no records tell these apart, and in
+        # the poor protocol other causes are locked to depth as well.
+        group = set(near_by[0]) if len(near_by) == 1 else set()
+        return {truth[0], LAW} <= group <= allowed | {*LOCKED_TO_DEPTH, LAW}
     # One cause: no other may stand beside it, and nothing outside its class.
-    return verdict == "cause" and len(named) == 1 and truth[0] in named[0] and not wrong
+    return bool(
+        verdict == "cause" and len(named) == 1 and truth[0] in named[0] and {*named[0]} <= allowed
+    )
 
 
 def _is_resolved(facts: Mapping[str, Any], truth: list[str]) -> bool:

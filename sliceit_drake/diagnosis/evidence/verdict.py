@@ -41,6 +41,8 @@ OF_THE_BOARD = ("board_height", "board_stiffness")
 measured, and then seems to be of another stiffness as well."""
 HALF = 0.5
 """Least share of the simulation's own error that a cause can do which is said to be near."""
+LIKE_LAW = (("in", "shared"), ("any", "shared"))
+"""Phases and parts of the simulation's own error that may be its law."""
 LAW = "law"
 """Name of the simulation's own law in a group."""
 
@@ -53,9 +55,11 @@ class DecisionRule:
         alarm: Greatest chance that a simulation as wrong as this one, with nothing else wrong,
             gives a gain as large as the largest.
         gain: Least gain, twice in log-likelihood, for each record, times what the simulation is
-            wrong by beside the cause over the noise, or 1 where that is less, as in the air: where
-            it is wrong in a form that the prior does not have, causes gain up to this.
-        beside: The same of a cause beside others that are named: these too may be of another form.
+            wrong by beside the cause over the noise: where it is wrong in a form that the prior
+            does not have, causes gain up to this. The factor is at least `right`; 1 in the air.
+        right: What the simulation is taken to be wrong by over the noise where it is less.
+        beside: As `gain`, of a cause beside others that are named: these too may be of another
+            form. Here, and where the food's file knows an error, `right` is 1.
         left: Least share of its gain alone that a cause keeps beside others. Less is what a form of
             theirs leaves: of a saw-tooth, waves at the frequency that it has at one speed.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
@@ -77,6 +81,7 @@ class DecisionRule:
 
     alarm: float = 0.02
     gain: float = 1.1
+    right: float = 0.5
     beside: float = 3.0
     left: float = 0.05
     size: float = 0.9
@@ -253,7 +258,7 @@ def reach_verdict(
     wrong, misfit, mostly = _own_error(OwnError.beside(problem, named_causes))
     causes = _verdicts(judged, findings, refused, rule)
     shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
-    if not named and misfit >= rule.unknown and mostly[0][1:3] == ("in", "shared"):
+    if not named and misfit >= rule.unknown and mostly[0][1:3] in LIKE_LAW:
         findings = _nearest(problem, screenings[0])
     trend = trend_of_slices(problem, [f.evidence.cause for f in findings if named], seed=seed)
     if trend is not None and (trend.p_value > rule.alarm or trend.size < rule.trend):
@@ -266,6 +271,8 @@ def reach_verdict(
             kind, reason = "unknown", f"{shown}, mostly {_words(mostly)}, "
             if findings:
                 reason += "which may be its law as well as shape, core or skin"
+                more = [n for n in findings[0].others if n not in (*LOCKED_TO_DEPTH, LAW)]
+                reason += "".join(f", or {name}" for name in more)
             else:
                 reason += "and no cause of the list explains it"
         elif trend is not None:
@@ -359,7 +366,8 @@ def _refusal(
     # A law cannot be wrong in the air.
     inside = 1.0 if e.per_record else _share_in_contact(problem, e)
     wrong = OwnError.beside(problem, [*before, e.cause])
-    wrong_by = 1.0 + inside * max(_own_error(wrong)[1] - 1.0, 0.0)
+    least_wrong = 1.0 if before or problem.found.known_from else rule.right
+    wrong_by = 1.0 + inside * (max(_own_error(wrong)[1], least_wrong) - 1.0)
     least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
     if e.gain < least:
         return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
@@ -428,8 +436,8 @@ def _others(problem: LinearProblem, screening: Screening, best: CauseEvidence) -
 
 def _nearest(problem: LinearProblem, screening: Screening) -> list[Finding]:
     """Where the simulation is wrong along depth, alike in all cuts, the cause locked to depth that
-    can do most of it, with the others and the law: which it is an experiment tells. None where none
-    can do half of it."""
+    can do most of it, with the others, the law, and what else can do as much in these records:
+    which it is an experiment tells. None where none that is locked to depth can do half of it."""
     wrong = OwnError.beside(problem, [])
     reduced = problem.reduced(wrong.model)
     F, Z = wrong.model.shared, problem.shapes
@@ -441,19 +449,19 @@ def _nearest(problem: LinearProblem, screening: Screening) -> list[Finding]:
     square -= float(b[F] @ covariance @ b[F])
     b = b - G[:, F] @ covariance @ b[F]
     G = beside(G, F, wrong.model.prior)
-    best, share = None, HALF
-    for name in (n for n in LOCKED_TO_DEPTH if n in screening.names):
+    shares: dict[str, float] = {}
+    for name in (e.name for e in screening.causes if not e.per_record):
         for scan in problem.found.scans(name):
             own = problem.found.index("cause", name, scan)
             inner = G[np.ix_(own, own)] + np.eye(len(own)) / PLAUSIBLE**2
             found = float(b[own] @ np.linalg.solve(inner, b[own])) / max(square, 1e-12)
-            if found > share:
-                best, share = name, found
-    if best is None:
+            shares[name] = max(found, shares.get(name, 0.0))
+    locked = sorted((n for n in LOCKED_TO_DEPTH if n in shares), key=lambda n: -shares[n])
+    if not locked or shares[locked[0]] <= HALF:
         return []
-    others = [n for n in LOCKED_TO_DEPTH if n != best and n in screening.names]
-    e = screening.evidence(best)
-    return [Finding(e, e.size, e.share, [*others, LAW])]
+    others = [n for n, share in shares.items() if share >= shares[locked[0]] and n not in locked]
+    e = screening.evidence(locked[0])
+    return [Finding(e, e.size, e.share, [*locked[1:], *others, LAW])]
 
 
 def _lasting(

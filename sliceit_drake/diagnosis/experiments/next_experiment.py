@@ -254,7 +254,9 @@ def next_experiment(
     verdict = diagnosis.verdict
     if verdict.kind == "too_few_replicates":
         return _repeat(diagnosis, records)
-    if verdict.kind == "unknown" and not verdict.findings:
+    # What is in the air as well is not told apart by cuts alone.
+    in_air = verdict.mostly[0][1] == "any"
+    if verdict.kind == "unknown" and (in_air or not verdict.findings):
         reason = (
             "no cause of the list explains what is wrong; what it depends on shows where speed, "
             "draw and pose differ most"
