@@ -20,7 +20,7 @@ from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, foretells,
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.evidence.screen import screen
-from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import LAW, DecisionRule, Verdict, reach_verdict
 from studies.hidden_effects.sizes import effect_in_noise
 
 
@@ -247,6 +247,37 @@ def test_what_the_form_of_a_named_cause_leaves_is_no_second_cause():
 
 def test_what_no_cause_explains_is_unknown():
     assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
+
+
+def wrong_along_depth(of_skin: float, of_rate: float) -> Verdict:
+    """Of records whose force is wrong along depth, where two causes do that and this much else."""
+    found = problem(41).found
+    names = [c.name for c in found.columns]
+    for k, r in enumerate(found.records):
+        turns = 2.0 * np.pi * np.clip(r.depth, 0.0, None) / 0.03
+        wrong, else_ = (1.2 * wave(turns) * r.in_contact for wave in (np.sin, np.cos))
+        columns = r.columns.copy()
+        columns[:, 0, names.index("skin")] = wrong + of_skin * else_
+        columns[:, 0, names.index("rate")] = wrong + of_rate * else_
+        found.records[k] = dc.replace(r, columns=columns, measured=r.measured + wrong[:, None])
+    return reach_verdict(LinearProblem(found), 60)
+
+
+def test_a_law_that_is_wrong_along_depth_is_set_beside_all_that_may_do_as_much():
+    both, skin = wrong_along_depth(0.5, 0.45), wrong_along_depth(0.5, 0.6)
+    assert both.kind == skin.kind == "unknown"
+    assert both.findings[0].names == ["skin", "rate", LAW] and both.reason.endswith(", or rate")
+    assert skin.findings[0].names == ["skin", LAW]
+
+
+def test_less_gain_is_asked_for_where_the_simulation_is_right():
+    whole = problem(20, rate=2.0)
+    verdict = reach_verdict(whole, 60)
+    by_record = verdict.findings[0].evidence.gain / len(whole.found.records)
+    assert verdict.misfit < DecisionRule.right
+    for factor, names in ((0.9, [["rate"]]), (1.1, [])):
+        rule = DecisionRule(gain=factor * by_record / DecisionRule.right)
+        assert reach_verdict(whole, 60, rule=rule).names == names
 
 
 def test_a_cause_in_the_air_is_found_where_the_law_is_wrong():

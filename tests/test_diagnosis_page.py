@@ -18,6 +18,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("explanation/diagnosis", f"The alarm of {100 * RULE.alarm:g} %"),
         ("explanation/diagnosis", f"is at least {RULE.size:g} of noise and own error together"),
         ("explanation/diagnosis", f"gains at least {RULE.gain:g} for each record, twice"),
+        ("explanation/diagnosis", f"as many times less is enough, down to {RULE.right:g}"),
         ("explanation/diagnosis", f"at least {RULE.beside:g} for each record beside others"),
         ("explanation/diagnosis", f"by {RULE.trend:g} of the noise or more is unknown"),
         ("explanation/diagnosis", f"shows in {100 * RULE.presence:g} % of the records"),

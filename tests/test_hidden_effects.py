@@ -187,6 +187,11 @@ def said(kind: str, effects: tuple[str, ...], verdict: str, *named: list[str]) -
         (said("single", ("skin",), "unknown", ["core", "skin", "law"]), True),
         (said("single", ("skin",), "unknown", ["core", "law"]), False),
         (said("single", ("sensor_delay",), "unknown", ["core", "skin", "law"]), False),
+        # In the poor protocol others are locked to depth too, and have to be listed.
+        (said("poor", ("flank_adhesion",), "unknown", ["core", "adhesion", "law"]), True),
+        (said("poor", ("flank_adhesion",), "unknown", ["core", "skin", "law"]), False),
+        (said("poor", ("flank_adhesion",), "unknown", ["core", "adhesion", "slip", "law"]), False),
+        (said("single", ("flank_adhesion",), "unknown", ["core", "adhesion", "law"]), False),
         (said("nothing", (), "nothing"), True),
         (said("nothing", (), "unknown"), False),
         (said("unknown", ("warm_wrist",), "unknown"), True),
