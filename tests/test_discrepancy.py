@@ -173,6 +173,23 @@ def test_the_gradient_is_that_of_differences(known: LinearProblem) -> None:
         assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.parametrize("narrow", [1.0, 0.05], ids=["inside", "at the ends"])
+def test_sizes_are_the_same_in_units_of_their_uncertainty(narrow: float) -> None:
+    whole = problem(records(np.random.default_rng(1)))
+    D = whole.discrepancy
+    D.spread = narrow * D.spread
+    model = whole.with_causes([2])
+    given = whole.by_condition(model), model.shared, model.prior[model.shared]
+    plain, value = D.fit(*given, tolerance=1e-5)
+    covariance = D.uncertain(given[0], plain, *given[1:])
+    away = Sizes.of(plain.flat + 0.2 * D.spread)
+    scaled, same = D.fit(*given, away, 1e-5, covariance)
+    np.testing.assert_allclose(scaled.flat, plain.flat, atol=1e-3 * narrow)
+    assert same == pytest.approx(value, abs=1e-6)
+    ends = (plain.flat - D.prior.flat) / D.spread
+    assert ((ends < -4.99) | (ends > 2.99)).any() == (narrow < 1.0)
+
+
 def test_what_is_found_of_it_is_its_mean_after_the_data(known: LinearProblem) -> None:
     sizes, model = some_sizes(3), known.with_causes([2])
     written = Written(known, sizes, model.shared, [VARIATION, 0.0])
