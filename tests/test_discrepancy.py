@@ -190,6 +190,22 @@ def test_sizes_are_the_same_in_units_of_their_uncertainty(narrow: float) -> None
     assert ((ends < -4.99) | (ends > 2.99)).any() == (narrow < 1.0)
 
 
+def test_no_step_of_a_search_leaves_the_ranges_of_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = problem(records(np.random.default_rng(1)))
+    D, model = whole.discrepancy, whole.with_causes([2])
+    seen, likelihood = [], D.likelihood
+
+    def looked_at(grams, sizes, fitted, prior):
+        seen.append((sizes.flat - D.prior.flat) / D.spread)
+        return likelihood(grams, sizes, fitted, prior)
+
+    monkeypatch.setattr(D, "likelihood", looked_at)
+    given = whole.by_condition(model), model.shared, model.prior[model.shared]
+    wide = 1e4 * np.eye(len(D.spread))
+    D.fit(*given, D.prior, 1e-5, wide)
+    assert len(seen) > 3 and np.min(seen) > -5.001 and np.max(seen) < 3.001
+
+
 def test_what_is_found_of_it_is_its_mean_after_the_data(known: LinearProblem) -> None:
     sizes, model = some_sizes(3), known.with_causes([2])
     written = Written(known, sizes, model.shared, [VARIATION, 0.0])

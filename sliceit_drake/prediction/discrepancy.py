@@ -447,9 +447,11 @@ class Discrepancy:
 
         def least(root: np.ndarray, bounds: Bounds | None) -> tuple[np.ndarray, float]:
             def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-                sizes = Sizes.of(first + root @ x)
-                value, gradient = self.likelihood(grams, sizes, fitted, prior)
-                return -value, -root.T @ gradient
+                flat = first + root @ x
+                # A step of the search may go anywhere.
+                near = np.clip(flat, *ends)
+                value, gradient = self.likelihood(grams, Sizes.of(near), fitted, prior)
+                return -value, -root.T @ (gradient * (near == flat))
 
             found = minimize(
                 objective,
