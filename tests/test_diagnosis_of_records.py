@@ -113,6 +113,12 @@ def test_a_hidden_effect_is_found_alone(cache, tmp_path, effect, seed, cause, of
     page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
     text = html.escape(result.sentence())
     assert 0 < page.index("<img") < page.index(text) < page.index("<pre>")
+    # Where the file is of quite another food, that is said whatever is found.
+    assert "calibrate" not in text
+    result.shifts = {"material.toughness": (2.1, 0.03), "material.friction": (1.3, 0.02)}
+    assert result.sentence().endswith(
+        "calibrate first: the file's food needs toughness times 2.10."
+    )
 
 
 def test_an_arm_that_gives_on_the_board_is_not_the_simulations_own_error(cache):

@@ -63,6 +63,8 @@ CALM = 0.3
 """Jump of the prediction, N, near which what is left does not set the scale of a plot."""
 SHIFT = 0.1
 """Logarithm of a shift of a base parameter from which on the first sentence names it."""
+OTHER_FOOD = 0.4
+"""The same from which on it advises to calibrate, whatever else was found."""
 
 
 class Result(Protocol):
@@ -307,7 +309,23 @@ def _short(value: float, digits: int = 3) -> str:
 
 
 def sentence(result: Result) -> str:
-    """What was found, in one or two sentences for people who know robots and no statistics."""
+    """What was found, in a few sentences for people who know robots and no statistics."""
+    moved = _moved(result, OTHER_FOOD)
+    if result.verdict.kind == "nothing" or not moved:
+        return _found(result)
+    return f"{_found(result)} But calibrate first: the file's food needs {', '.join(moved)}."
+
+
+def _moved(result: Result, least: float) -> list[str]:
+    """Base parameters that are off by a logarithm of at least this much, and by how much."""
+    return [
+        f"{name.rpartition('.')[2].replace('_', ' ')} times {factor:.2f}"
+        for name, (factor, error) in result.shifts.items()
+        if abs(np.log(factor)) > max(least, 2.0 * error)
+    ]
+
+
+def _found(result: Result) -> str:
     verdict, gain = result.verdict, result.gain
     place = _place(result)
     record = result.problem.found.records[place.record]
@@ -316,11 +334,7 @@ def sentence(result: Result) -> str:
     where += f", of {record.condition or record.name}"
     names = " and ".join(name for name, _ in verdict.named)
     if verdict.kind == "nothing":
-        moved = [
-            f"{name.rpartition('.')[2].replace('_', ' ')} times {factor:.2f}"
-            for name, (factor, error) in result.shifts.items()
-            if abs(np.log(factor)) > max(SHIFT, 2.0 * error)
-        ]
+        moved = _moved(result, SHIFT)
         so = f"With its {', '.join(moved)} the" if moved else "The"
         return (
             f"{so} simulation is as close to these records as noise and slices that differ allow"
