@@ -17,6 +17,7 @@ from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, 
 from sliceit_drake.diagnosis.evidence.linear import PLAUSIBLE, LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, screen
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule
 
 ROWS = 200
 NOISE = 0.1
@@ -177,6 +178,10 @@ def test_a_delay_within_the_usual_is_no_cause_and_one_far_beyond_is():
         assert screening.evidence("sensor_delay").gain == pytest.approx(max(gain, 0.0), rel=0.1)
         known.append(screening.evidence("sensor_delay").gain)
     assert known[0] == 0.0 and known[1] > 10.0
+    # It acts most in rows that are doubted: less size is asked for than of what no sensor has.
+    rule, delay = DecisionRule(), screening.evidence("sensor_delay")
+    assert rule.least_size(problem, delay) == rule.size_known < rule.size
+    assert rule.least_size(problem, screening.evidence("plain")) == rule.size
 
 
 def test_p_values_are_uniform_where_the_model_is_right():

@@ -67,7 +67,8 @@ class DecisionRule:
             causes of up to this size.
         size_by_record: The same of an effect that differs from record to record, over the noise
             alone: no own error does that.
-        size_known: The same where the food's file knows what the simulation gets wrong.
+        size_known: The same where the food's file knows what the simulation gets wrong, and of what
+            every sensor has a little of, as a delay, which has to gain beyond that.
         limit: Level of the intervals of the causes' numbers.
         replicates: Slices of a condition from which variation can be told from an effect.
         presence: Share of the records in which a cause shows that has numbers of its own in each.
@@ -97,8 +98,10 @@ class DecisionRule:
 
     def least_size(self, problem: LinearProblem, e: CauseEvidence) -> float:
         """Of a cause that is named."""
-        shared = self.size_known if problem.found.known_from else self.size
-        return self.size_by_record if e.per_record else shared
+        if e.per_record:
+            return self.size_by_record
+        usual = set(problem.usual) & {*problem.found.of_causes([e.cause])}
+        return self.size_known if usual or problem.found.known_from else self.size
 
 
 @dc.dataclass
