@@ -127,6 +127,7 @@ def test_a_wrong_url_is_refused_without_its_password(database, tmp_path, capsys,
     printed = capsys.readouterr()
     assert "--storage" in printed.err and said in printed.err and "PGPASSWORD" in printed.err
     assert secret not in printed.err + printed.out
+    assert "First fit" not in printed.out
 
 
 def test_passwords_of_urls_are_not_kept_in_a_command():

@@ -191,7 +191,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
     from sliceit_drake.calibration.setup import load_setup, setup_of_record
-    from sliceit_drake.calibration.storage import without_password
+    from sliceit_drake.calibration.storage import open_storage, without_password
     from sliceit_drake.calibration.structure import choice_in, puncture_lines
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import check_record, load_record, record_files
@@ -213,6 +213,9 @@ def _calibrate(options: argparse.Namespace) -> int:
                 field="--hold-out",
                 fix="Give the names of records that are given.",
             )
+    if options.storage is not None:
+        # One that cannot be opened is said before anything is computed.
+        open_storage(options.storage)
     fitted = [r for r in records if r.name not in options.hold_out]
     start = values_of(load_calibrated_food(options.start)) if options.start else None
     warnings: list[str] = []
