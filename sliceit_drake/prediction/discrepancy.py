@@ -439,8 +439,8 @@ class Discrepancy:
             grams, fitted, prior: As for `likelihood`.
             start: Where the search begins; the prior's medians by default.
             tolerance: Of the gradient.
-            covariance: About that of the logarithms of the sizes: in its units a search takes a
-                third of the evaluations.
+            covariance: About that of the logarithms of the sizes: in its units a search takes few
+                evaluations.
         """
         first = (start or self.prior).flat
         ends = self.prior.flat - 5.0 * self.spread, self.prior.flat + 3.0 * self.spread

@@ -403,7 +403,7 @@ def diagnosis_rows(docs: Docs) -> Iterator[Row]:
     ):
         value = met = None
         if values:
-            value = f"{values[key]:.0f} s, {values['records']:.0f} records"
+            value = f"{values[key]:.1f} s, {values['records']:.0f} records"
             met = values[key] <= limit and values["records"] >= 18
         yield Row(what, f"<= {limit:.0f} s", value, met, command, source)
     study = docs.facts("hidden_effects.json") or {"requirements": []}
