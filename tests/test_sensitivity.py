@@ -14,7 +14,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter
 from sliceit_drake.diagnosis.causes.contact import BluntEdge, FlankAdhesion
 from sliceit_drake.diagnosis.causes.material import SkinToughness, ToughnessBySpeed
-from sliceit_drake.diagnosis.causes.mounting import BoardLaw
+from sliceit_drake.diagnosis.causes.mounting import BoardLaw, FoodSlip
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
@@ -236,6 +236,33 @@ def test_results_are_found_again_until_a_cause_changes(tmp_path):
     other = sensitivities(setup, moved, [BluntEdge()], finer=None, cache=tmp_path / "cache")
     assert other.records[0].residual == pytest.approx(first.records[0].residual, abs=5.0)
     assert not np.array_equal(other.records[0].measured, first.records[0].measured)
+
+
+def test_what_a_cause_saw_in_a_record_is_kept_for_that_record_alone(tmp_path):
+    setup, _ = bench()
+    (record,) = slices("fast")
+    middle = record.time[record.phase("slice")].mean()
+
+    def knocked(name: str, moment: float) -> SliceRecord:
+        force = record.force + np.outer(record.time > moment, [0.0, 3.0, 0.0])
+        return dc.replace(record, force=force, metadata=dc.replace(record.metadata, name=name))
+
+    # The same path, so that only the name tells them apart.
+    records = [knocked("early", middle - 0.05), knocked("late", middle + 0.05)]
+    cache = tmp_path / "cache"
+    first, again, afresh = (
+        sensitivities(setup, records, [FoodSlip()], finer=None, cache=where)
+        for where in (cache, cache, None)
+    )
+    (knock,) = first.index("cause", "slip", 0.05)[1:2]
+    early, late = (r.columns[:, 1, knock] for r in first.records)
+    assert abs(np.argmax(np.abs(early)) - np.argmax(np.abs(late))) > 5
+    for found in (again, afresh):
+        for a, b in zip(first.records, found.records, strict=True):
+            assert np.array_equal(a.columns, b.columns)
+    moved = [knocked("early", middle + 0.02), knocked("late", middle - 0.02)]
+    other = sensitivities(setup, moved, [FoodSlip()], finer=None, cache=cache)
+    assert not np.array_equal(other.records[0].columns, first.records[0].columns)
 
 
 class StepLaw(Cause):

@@ -153,12 +153,14 @@ def sensitivities(
         changes: list[_Change], some: Sequence[Cause], show: Progress | None
     ) -> Sensitivities:
         common = None
-        if cache is not None and not any(cause.adapts for cause in some):
+        if cache is not None:
             common = _common_key(setup, some, point, not changes, finer)
         by_slice = setup.food.effects.entry.dulling > 0.0
         by_slice |= any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
+        by_name = any(cause.adapts for cause in some)
         changes = changes + [change for cause in some for change in _cause_changes(cause, point)]
-        return _Computation(predictor, point, changes, store, common, by_slice).result(show)
+        computation = _Computation(predictor, point, changes, store, common, by_slice, by_name)
+        return computation.result(show)
 
     # What replicates share is computed once for all of them.
     shared = [c for c in causes if not (c.by_slice or c.adapts)]
@@ -176,9 +178,10 @@ def sensitivities(
 class _Computation:
     """Some columns of one set of records; records that are known are not computed again.
 
-    What was measured does not matter: another cut along the same path is found at once. `common` is
-    the key of all that does not differ between records, None where nothing is kept; `by_slice` says
-    whether it matters which slice of the session a record is.
+    What was measured does not matter, but to causes that adapt: another cut along the same path is
+    found at once. `common` is the key of all that does not differ between records, None where
+    nothing is kept; `by_slice` says whether it matters which slice of the session a record is, and
+    `by_name` which record.
     """
 
     predictor: SlicePredictor
@@ -187,6 +190,7 @@ class _Computation:
     store: ContentStore
     common: str | None
     by_slice: bool
+    by_name: bool
 
     def result(self, progress: Progress | None) -> Sensitivities:
         """All columns of all records."""
@@ -258,8 +262,9 @@ class _Computation:
         return record, arrays["failed"].tolist()
 
     def _key(self, target: RecordTarget) -> str:
-        metadata = dc.replace(target.record.metadata, name="", condition="")
-        facts = dc.replace(target.facts, name="", condition="")
+        name = target.facts.name if self.by_name else ""
+        metadata = dc.replace(target.record.metadata, name=name, condition="")
+        facts = dc.replace(target.facts, name=name, condition="")
         if not self.by_slice:
             metadata = dc.replace(metadata, slice_index=0, knife_slices=None)
             facts = dc.replace(facts, slice_index=0, knife_slices=0)
