@@ -115,6 +115,7 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "1 min",
             "hardware",
         ),
+        Study("soak", "project.soak", "an hour of everything side by side, killed", "1 h", "learn"),
         Study("endurance", "robot.endurance", "memory over an hour of slices", "1 h"),
     ),
     "calibration": (

@@ -323,6 +323,7 @@ READ_ONLY = {
         python -m studies scaling --output docs/results/scaling.md
         python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/results/scaling.md
         python -m studies slicing_ablations --folder output/ablations --output docs/results/learning.md
+        python -m studies soak --minutes 60 --output docs/results/soak.md
         python -m studies soft_foods --output docs/results/soft_foods.md
         python -m studies split_step_limit
         python -m studies stand_in_figure

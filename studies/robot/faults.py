@@ -122,7 +122,7 @@ def slice_with(case: Case, address: str, overrides: str, set_robot: str = "") ->
         finally:
             process.kill()
             process.wait()
-        status = _await_rest(pendant)
+        status = await_rest(pendant)
         log = [(float(when), str(text)) for when, text in status["log"]]
         begin = next((when for when, text in log if text == f"injected: {MARK}"), np.nan)
         trace = np.array(pendant.trace(begin if np.isfinite(begin) else 0.0))
@@ -157,7 +157,7 @@ def _output(process: subprocess.Popen, case: Case) -> str:
     return printed.decode("utf-8", "replace")
 
 
-def _await_rest(pendant: PendantClient) -> dict:
+def await_rest(pendant: PendantClient) -> dict:
     end = time.monotonic() + PATIENCE
     while True:
         status = pendant.status()

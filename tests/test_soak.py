@@ -1,0 +1,68 @@
+"""The soak: a run that is killed and called again loses nothing, and what does is found."""
+
+import sys
+import time
+
+import pytest
+
+from studies.project import soak
+from studies.project.soak import Job, Soak
+
+WRITE = """
+import pathlib, subprocess, sys, time
+folder = pathlib.Path(sys.argv[1])
+folder.mkdir(parents=True, exist_ok=True)
+file = folder / "result"
+done = len(file.read_text()) if file.exists() else 0
+{more}
+with file.open("a") as out:
+    for _ in range(20 - done):
+        out.write("x")
+        out.flush()
+        time.sleep(0.02)
+"""
+
+
+def soaked(tmp_path, more: str = "", seconds: float = 4.0) -> Soak:
+    script = tmp_path / "script.py"
+    script.write_text(WRITE.replace("{more}", more))
+    command = (sys.executable, str(script), "{folder}")
+    made = Soak(Job("write", command, ("result",)), tmp_path / "runs", seed=1)
+    made.until(time.monotonic() + seconds)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def _short_linger(monkeypatch):
+    monkeypatch.setattr(soak, "LINGER", 0.5)
+
+
+def test_what_goes_on_after_a_kill_loses_nothing(tmp_path):
+    made = soaked(tmp_path)
+    assert sum(r.kills for r in made.runs) > 1
+    assert made.runs[0].kills == 0
+    assert not made.lost()
+
+
+def test_what_begins_anew_in_an_old_file_is_found(tmp_path):
+    lost = soaked(tmp_path, "done = 0").lost()
+    assert lost and all("result is not that of the first run" in text for text in lost)
+
+
+def test_a_process_that_is_left_behind_is_found(tmp_path):
+    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(3)'])"
+    lost = soaked(tmp_path, child, seconds=1.0).lost()
+    assert lost and all("left behind" in text and "time.sleep(3)" in text for text in lost)
+
+
+def test_a_run_that_fails_is_found_with_its_last_words(tmp_path):
+    lost = soaked(tmp_path, "done or sys.exit('no disk')", seconds=0.5).lost()
+    assert any("ended with status 1: no disk" in text for text in lost)
+    assert any("result is not there" in text for text in lost)
+
+
+def test_memory_that_grows_from_run_to_run_is_found(tmp_path):
+    made = soaked(tmp_path, seconds=2.0)
+    for number, one in enumerate(made.runs):
+        one.memory = 100.0 + 20.0 * number
+    assert ["memory from" in text for text in made.lost()] == [True]
