@@ -16,14 +16,14 @@ file = folder / "result"
 done = len(file.read_text()) if file.exists() else 0
 {more}
 with file.open("a") as out:
-    for _ in range(20 - done):
+    for _ in range(10 - done):
         out.write("x")
         out.flush()
         time.sleep(0.02)
 """
 
 
-def soaked(tmp_path, more: str = "", seconds: float = 4.0) -> Soak:
+def soaked(tmp_path, more: str = "", seconds: float = 2.0) -> Soak:
     script = tmp_path / "script.py"
     script.write_text(WRITE.replace("{more}", more))
     command = (sys.executable, str(script), "{folder}")
@@ -34,7 +34,7 @@ def soaked(tmp_path, more: str = "", seconds: float = 4.0) -> Soak:
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch):
-    monkeypatch.setattr(soak, "LINGER", 0.5)
+    monkeypatch.setattr(soak, "LINGER", 0.3)
 
 
 def test_what_goes_on_after_a_kill_loses_nothing(tmp_path):
@@ -50,9 +50,9 @@ def test_what_begins_anew_in_an_old_file_is_found(tmp_path):
 
 
 def test_a_process_that_is_left_behind_is_found(tmp_path):
-    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(3)'])"
+    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(1)'])"
     lost = soaked(tmp_path, child, seconds=1.0).lost()
-    assert lost and all("left behind" in text and "time.sleep(3)" in text for text in lost)
+    assert lost and all("left behind" in text and "time.sleep(1)" in text for text in lost)
 
 
 def test_a_run_that_fails_is_found_with_its_last_words(tmp_path):
@@ -62,7 +62,7 @@ def test_a_run_that_fails_is_found_with_its_last_words(tmp_path):
 
 
 def test_memory_that_grows_from_run_to_run_is_found(tmp_path):
-    made = soaked(tmp_path, seconds=2.0)
+    made = soaked(tmp_path, seconds=1.0)
     for number, one in enumerate(made.runs):
         one.memory = 100.0 + 20.0 * number
     assert ["memory from" in text for text in made.lost()] == [True]
