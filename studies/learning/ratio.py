@@ -40,9 +40,8 @@ def bootstrap_ratio(
 
     def means(values: np.ndarray) -> np.ndarray:
         policies = rng.integers(len(values), size=(draws, len(values)))
-        return np.array(
-            [values[np.ix_(p, s)].mean() for p, s in zip(policies, slices, strict=True)]
-        )
+        drawn = values[policies[:, :, None], slices[:, None, :]]
+        return drawn.reshape(draws, -1).mean(1)
 
     def over(above: np.ndarray, below: np.ndarray) -> np.ndarray:
         return np.divide(above, below, out=np.full(above.shape, np.inf), where=below > 0.0)
