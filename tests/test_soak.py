@@ -64,5 +64,5 @@ def test_a_run_that_fails_is_found_with_its_last_words(tmp_path):
 def test_memory_that_grows_from_run_to_run_is_found(tmp_path):
     made = soaked(tmp_path, seconds=1.0)
     for number, one in enumerate(made.runs):
-        one.memory = 100.0 + 20.0 * number
+        one.kills, one.memory = 0, 100.0 + 20.0 * number
     assert ["memory from" in text for text in made.lost()] == [True]

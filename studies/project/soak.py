@@ -38,8 +38,9 @@ from studies.robot.faults import CLIENT_PACE, MOTION, PACE, await_rest
 __all__ = ["Job", "Run", "Soak", "add_arguments", "run"]
 
 SLICEIT = (sys.executable, "-m", "sliceit_drake.cli.main")
-MORE = 1.1
-"""Allowed peak memory of the last third of a job's runs, over that of the first third."""
+MORE = 1.2
+"""Allowed peak memory of the last third of a job's runs, over that of the first third. Equal runs
+of a calibration differ by 14 % (888 to 1,010 MB of six)."""
 LINGER = 20.0
 """Wall time in which the processes of a killed run have to end, s."""
 
@@ -104,7 +105,8 @@ class Soak:
         The first run of all is not killed: the others are compared with it.
         """
         while not self.runs or time.monotonic() < end:
-            folder = self.folder / f"{len(self.runs)}"
+            # Always the same, since results may name it.
+            folder = self.folder / "run"
             made = Run()
             killed = True
             while killed:
@@ -169,8 +171,8 @@ class Soak:
                 made.lost.append(f"{name} is not that of the first run")
 
     def memory(self) -> tuple[float, float]:
-        """Median peak of the first third of the runs, and of the last, MB."""
-        peaks = [r.memory for r in self.runs]
+        """Median peak of the first third of the runs without a kill, and of the last, MB."""
+        peaks = [r.memory for r in self.runs if not r.kills]
         third = max(len(peaks) // 3, 1)
         return float(np.median(peaks[:third])), float(np.median(peaks[-third:]))
 
@@ -230,7 +232,7 @@ def jobs(records: Path) -> list[Job]:
     to = ("--output", "{folder}")
     simulate = ("simulate", "cucumber_measured", "--no-replay", "--no-animation")
     potato = ("calibration/records/potato.csv", "--food", "potato", "--workers", "1")
-    fast = ("--trials", "20", "--starts", "1", "--steps", "5", "--blocks", "0")
+    fast = ("--trials", "10", "--starts", "1", "--steps", "3", "--blocks", "0")
     diagnose = ("diagnose", str(records), "--model", "cucumber", "--workers", "1")
     train = ("train", "--steps", "800", "--set", "warm_up=200,validation_interval=400")
     often = ("--set", "validation_slices=2,checkpoint_interval=200")
@@ -293,17 +295,15 @@ def run(options: argparse.Namespace) -> int:
 def _draw(soaks: Sequence[Soak], file: Path) -> None:
     """Peak memory of each run; those that were killed stand out."""
     figure = new_figure(10.0, 3.6)
-    for k, (axes, soak) in enumerate(
-        zip(figure.subplots(1, len(soaks), sharey=True), soaks, strict=True)
-    ):
+    for axes, soak in zip(figure.subplots(1, len(soaks), sharey=True), soaks, strict=True):
         for killed, colour in ((False, BLUE), (True, ORANGE)):
             runs = [n for n, r in enumerate(soak.runs) if bool(r.kills) == killed]
             peaks = [soak.runs[n].memory for n in runs]
             label = "killed, and called again" if killed else "not killed"
             axes.plot(runs, peaks, "o", ms=4, color=colour, label=label)
         tidy(axes, soak.job.name)
-        axes.set(xlabel="run", ylim=(0.0, None))
-        if k == 0:
-            axes.set_ylabel("peak memory [MB]")
-            axes.legend(frameon=False, fontsize=8)
+        axes.set_xlabel("run")
+    most = max(r.memory for soak in soaks for r in soak.runs)
+    figure.axes[0].set(ylabel="peak memory [MB]", ylim=(0.0, 1.1 * most))
+    figure.axes[0].legend(frameon=False, fontsize=8, loc="lower left")
     save_figure(figure, file, dpi=100)
