@@ -8,6 +8,7 @@ import pytest
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting import motion_optimization
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -15,7 +16,12 @@ from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import PressAndDraw
-from sliceit_drake.cutting.motion_optimization import MotionLimits, mean_force, optimize_motion
+from sliceit_drake.cutting.motion_optimization import (
+    MotionLimits,
+    mean_force,
+    optimize_motion,
+    places,
+)
 from sliceit_drake.diagrams.scenario import load_scenario
 
 NAMES = ("amplitude", "frequency", "press_speed")
@@ -63,7 +69,7 @@ def test_a_faster_draw_lowers_the_force_as_atkins_says():
 def test_the_optimum_keeps_its_limits_and_no_neighbour_within_them_is_better():
     model = model_of()
     limits = MotionLimits(duration=1.2, draw_speed=0.1, draw_acceleration=1.5)
-    found = optimize_motion(model, limits, iterations=12)
+    found = optimize_motion(model, limits, iterations=12, starts=1)
     motion, adjoint = found.motion, SliceAdjoint(model, 0.002)
     omega = 2.0 * np.pi * motion.frequency
     assert motion.amplitude * omega <= limits.draw_speed * (1.0 + 1e-6)
@@ -83,6 +89,46 @@ def test_the_optimum_keeps_its_limits_and_no_neighbour_within_them_is_better():
             )
             if keeps:
                 assert mean_force(adjoint, near)[0] > 0.98 * found.force
+
+
+def test_other_places_to_begin_at_leave_a_local_minimum(monkeypatch):
+    # Two valleys along the logarithm of the frequency: a shallow one at 0.6 Hz, a deep one at 3 Hz.
+    model, limits = model_of(), MotionLimits()
+
+    def two_valleys(adjoint, motion):
+        x = np.log(motion.frequency)
+        rows = [(1.0, np.log(0.6), 0.3), (2.0, np.log(3.0), 0.3)]
+        value = 5.0 - sum(h * np.exp(-0.5 * ((x - at) / w) ** 2) for h, at, w in rows)
+        by_x = sum(h * (x - at) / w**2 * np.exp(-0.5 * ((x - at) / w) ** 2) for h, at, w in rows)
+        return value, np.array([0.0, by_x / motion.frequency, 0.0])
+
+    monkeypatch.setattr(motion_optimization, "mean_force", two_valleys)
+    monkeypatch.setattr(motion_optimization, "mean_force_alone", lambda adjoint, motion: 5.0)
+    seen = []
+    once, often = (
+        optimize_motion(model, limits, starts=n, progress=lambda *row: seen.append(row))
+        for n in (1, 3)
+    )
+    assert once.motion.frequency == pytest.approx(0.6, rel=0.05)
+    assert often.motion.frequency == pytest.approx(3.0, rel=0.05)
+    assert often.by_start[0] == once.force and often.force == min(often.by_start)
+    assert often.start_force == once.start_force and often.evaluations > once.evaluations
+    # The number of slices counts on, and the best never gets worse.
+    counts, forces, _ = zip(*seen[once.evaluations :], strict=True)
+    assert counts == tuple(range(1, often.evaluations + 1))
+    assert list(forces) == sorted(forces, reverse=True)
+
+
+def test_places_to_begin_at_keep_the_limits():
+    model, limits = model_of(), MotionLimits(duration=1.2, draw_speed=0.1, draw_acceleration=1.5)
+    low, high = limits.ranges(model)
+    for shares in (*places(8), np.zeros(3), np.ones(3)):
+        motion = limits.motion(model, shares)
+        values = np.array([getattr(motion, name) for name in NAMES])
+        assert (low - 1e-12 <= values).all() and (values <= high * (1.0 + 1e-12)).all()
+        omega = 2.0 * np.pi * motion.frequency
+        assert motion.amplitude * omega <= limits.draw_speed * (1.0 + 1e-12)
+        assert motion.amplitude * omega**2 <= limits.draw_acceleration * (1.0 + 1e-12)
 
 
 def test_limits_that_no_motion_keeps_are_named():
@@ -107,12 +153,17 @@ def test_the_command_leaves_a_scenario_that_simulate_takes(tmp_path, capsys):
         str(out),
         "--iterations",
         "2",
+        "--starts",
+        "2",
     ]
     assert main(arguments) == 0
-    assert "N in the mean over the depth" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "N in the mean over the depth" in said
     scenario = load_scenario(out / "scenario.yaml")
     slicing = scenario.motion.segments[0]
     summary = json.loads((out / "summary.json").read_text())
+    assert len(summary["by_start"]) == 2 and min(summary["by_start"]) == summary["force"]
+    assert f"from each start: {summary['by_start'][0]:.2f}, " in said
     assert slicing.amplitude == pytest.approx(summary["motion"]["amplitude"])
     assert slicing.distance == pytest.approx(scenario.start.clearance + 0.02 + 2e-4, abs=1e-3)
     assert main(["simulate", str(out / "scenario.yaml"), "--duration", "0.1", "--no-replay",

@@ -40,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--iterations", metavar="N", type=int, default=30, help="most of the optimiser; 30"
     )
+    parser.add_argument(
+        "--starts",
+        metavar="N",
+        type=int,
+        default=3,
+        help="places from which it begins, for it stops in local minima; 3",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -52,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.cutting.motion_optimization import MotionLimits
     from sliceit_drake.diagrams.optimized_scenario import optimize_scenario
 
-    check_numbers(options, iterations=(1, math.inf))
+    check_numbers(options, iterations=(1, math.inf), starts=(1, math.inf))
     limits = MotionLimits(
         duration=options.duration,
         draw_speed=options.draw_speed,
@@ -64,7 +71,9 @@ def run(options: argparse.Namespace) -> int:
         def show(count: int, force: float, motion: PressAndDraw) -> None:
             bars.show("slices", count, None, f"{force:.2f} N")
 
-        scenario, found = optimize_scenario(scenario_of(options), limits, options.iterations, show)
+        scenario, found = optimize_scenario(
+            scenario_of(options), limits, options.iterations, options.starts, show
+        )
     motion = found.motion
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(scenario, options.output / "scenario.yaml")
@@ -75,6 +84,8 @@ def run(options: argparse.Namespace) -> int:
         f"{motion.frequency:.2f} Hz: {found.force:.2f} N in the mean over the depth; pressed as "
         f"fast without a draw {found.press_force:.2f} N, at the start {found.start_force:.2f} N"
     )
+    forces = ", ".join(f"{force:.2f}" for force in found.by_start)
+    print(f"from each start: {forces} N")
     print(f"limits that it touches: {', '.join(found.active) or 'none'}")
     print(f"sliceit simulate {options.output / 'scenario.yaml'} --output FOLDER")
     return 0

@@ -3,7 +3,8 @@
 The knife presses at constant speed v and draws by A sin(2 pi f t). What is minimised is the mean of
 |F| over the depth, whose derivative by every pose of the knife the adjoint gives
 (`cutting.gradient`); the rest is the chain rule. Scipy's SLSQP (Kraft 1988) minimises it under
-constraints that are functions of A, f and v alone.
+constraints that are functions of A, f and v alone. It stops in local minima, so it begins at
+several places, points of Halton's sequence.
 """
 
 import dataclasses as dc
@@ -11,13 +12,21 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import qmc
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.cutting.gradient import SliceAdjoint
+from sliceit_drake.cutting.gradient import SliceAdjoint, SliceRun
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import PressAndDraw
 
-__all__ = ["MotionLimits", "Optimum", "mean_force", "optimize_motion"]
+__all__ = [
+    "MotionLimits",
+    "Optimum",
+    "mean_force",
+    "mean_force_alone",
+    "optimize_motion",
+    "places",
+]
 
 SMOOTH = 0.05
 """Force below which |F| is rounded off, N."""
@@ -60,6 +69,50 @@ class MotionLimits:
             )
         return reach
 
+    def ranges(self, model: CuttingModel) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest amplitude, m, frequency, Hz, and press speed, m/s [3].
+
+        Raises:
+            ConfigurationError: No motion keeps them.
+        """
+        height = _height(model)
+        slowest = max(self.press_speed[0], height / self.duration)
+        low = np.array([0.0, self.frequency[0], slowest])
+        high = np.array([self.amplitude(model), self.frequency[1], self.press_speed[1]])
+        if (low > high).any():
+            raise ConfigurationError(
+                f"{height:.4g} m in {self.duration:.4g} s need more than {high[2]:.4g} m/s",
+                field="press_speed",
+                fix="Allow more time or a greater speed.",
+            )
+        return low, high
+
+    def motion(self, model: CuttingModel, shares: np.ndarray) -> PressAndDraw:
+        """A motion within the limits.
+
+        Args:
+            model: The cut.
+            shares: Of the amplitude that the frequency leaves, and of the ranges of frequency and
+                press speed, by their logarithms [3]; 0 to 1.
+        """
+        low, high = self.ranges(model)
+        f, v = (low[1:] * (high[1:] / low[1:]) ** shares[1:]).tolist()
+        omega = 2.0 * np.pi * f
+        most = min(high[0], self.draw_speed / omega, self.draw_acceleration / omega**2)
+        height = _height(model)
+        return PressAndDraw(
+            press_speed=v, distance=height, amplitude=float(shares[0] * most), frequency=f
+        )
+
+
+def places(count: int) -> np.ndarray:
+    """The middle, and points of Halton's sequence: where a search begins [count, 3]."""
+    return np.vstack([np.full(3, 0.5), qmc.Halton(3, scramble=False).random(count)[1:]])
+
+
+def _height(model: CuttingModel) -> float:
+    return model.top - model.bottom + CLEARANCE
+
 
 @dc.dataclass
 class Optimum:
@@ -68,20 +121,59 @@ class Optimum:
     Attributes:
         motion: The best.
         force: Mean of |F| over the depth with it, N.
-        start_force: Mean force of the motion at the start, N.
+        by_start: The same of the best from each place that was begun at, N.
+        start_force: Mean force of the motion in the middle of what the limits allow, N.
         press_force: Mean force of a press of the same speed, without a draw, N.
         evaluations: Slices with gradients that were simulated.
         active: Limits that the motion touches.
-        converged: Whether the optimiser ended by its own criterion.
+        converged: Whether the optimiser ended by its own criterion, from where the best came.
     """
 
     motion: PressAndDraw
     force: float
+    by_start: list[float]
     start_force: float
     press_force: float
     evaluations: int
     active: list[str]
     converged: bool
+
+
+@dc.dataclass
+class _Cut:
+    """A press by a motion: times of the coupling steps' ends [E + 1], the slice, norms [E] of the
+    food's force and their shares in the mean [E]."""
+
+    time: np.ndarray
+    run: SliceRun
+    norm: np.ndarray
+    share: np.ndarray
+
+
+def _cut(adjoint: SliceAdjoint, motion: PressAndDraw) -> _Cut:
+    model, period = adjoint.model, adjoint.exchange_period
+    A, omega, v = motion.amplitude, 2.0 * np.pi * motion.frequency, motion.press_speed
+    way = _height(model)
+    coupling_steps = way / v / period
+    time = period * np.arange(int(np.ceil(coupling_steps)) + 1)
+    middle = 0.5 * float(model.nodes[:, 0].min() + model.nodes[:, 0].max())
+    p = np.zeros((len(time), 3))
+    p[:, 0] = middle + A * np.sin(omega * time)
+    p[:, 2] = model.top + CLEARANCE - v * time
+    # In C the edge points down and x stays along it.
+    R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(time), 1, 1))
+    run = adjoint.run(R, p)
+    norm = np.sqrt((run.wrenches[:, 3:] ** 2).sum(1) + SMOOTH**2)
+    share = np.full(len(norm), v * period / way)
+    # The last coupling step goes beyond the bottom.
+    share[-1] *= coupling_steps - (len(norm) - 1)
+    return _Cut(time, run, norm, share)
+
+
+def mean_force_alone(adjoint: SliceAdjoint, motion: PressAndDraw) -> float:
+    """`mean_force` without its derivatives."""
+    cut = _cut(adjoint, motion)
+    return float(cut.share @ cut.norm)
 
 
 def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.ndarray]:
@@ -97,31 +189,16 @@ def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.n
     Raises:
         CuttingError: The slice breaks down.
     """
-    model, period = adjoint.model, adjoint.exchange_period
+    cut = _cut(adjoint, motion)
     A, omega, v = motion.amplitude, 2.0 * np.pi * motion.frequency, motion.press_speed
-    way = model.top - model.bottom + CLEARANCE
-    coupling_steps = way / v / period
-    time = period * np.arange(int(np.ceil(coupling_steps)) + 1)
-    middle = 0.5 * float(model.nodes[:, 0].min() + model.nodes[:, 0].max())
-    p = np.zeros((len(time), 3))
-    p[:, 0] = middle + A * np.sin(omega * time)
-    p[:, 2] = model.top + CLEARANCE - v * time
-    # In C the edge points down and x stays along it.
-    R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(time), 1, 1))
-    run = adjoint.run(R, p)
-    force = run.wrenches[:, 3:]
-    norm = np.sqrt((force**2).sum(1) + SMOOTH**2)
-    share = np.full(len(norm), v * period / way)
-    # The last coupling step goes beyond the bottom.
-    share[-1] *= coupling_steps - (len(norm) - 1)
-    weights = np.zeros_like(run.wrenches)
-    weights[:, 3:] = share[:, None] * force / norm[:, None]
-    by_p = adjoint.gradient(run, weights).position
-    by_A = by_p[:, 0] @ np.sin(omega * time)
-    by_f = by_p[:, 0] @ (A * 2.0 * np.pi * time * np.cos(omega * time))
-    value = float(share @ norm)
+    weights = np.zeros_like(cut.run.wrenches)
+    weights[:, 3:] = (cut.share / cut.norm)[:, None] * cut.run.wrenches[:, 3:]
+    by_p = adjoint.gradient(cut.run, weights).position
+    by_A = by_p[:, 0] @ np.sin(omega * cut.time)
+    by_f = by_p[:, 0] @ (A * 2.0 * np.pi * cut.time * np.cos(omega * cut.time))
+    value = float(cut.share @ cut.norm)
     # A coupling step's share grows with v, their number with 1 / v.
-    by_v = -by_p[:, 2] @ time + value / v - float(norm[-1]) / v
+    by_v = -by_p[:, 2] @ cut.time + value / v - float(cut.norm[-1]) / v
     return value, np.array([by_A, by_f, by_v])
 
 
@@ -130,71 +207,27 @@ def optimize_motion(
     limits: MotionLimits,
     period: float = 0.002,
     iterations: int = 30,
+    starts: int = 3,
     progress: Callable[[int, float, PressAndDraw], None] | None = None,
 ) -> Optimum:
-    """The press and draw with the least mean force, from the middle of what the limits allow.
+    """The press and draw with the least mean force.
 
     Args:
         model, limits: The cut, and what the motion may be.
         period: Coupling step period, s.
-        iterations: Most of the optimiser.
+        iterations: Most of the optimiser, from each place.
+        starts: Places to begin at: the middle of what the limits allow, and others.
         progress: Called with the number of slices, the best force so far, N, and its motion.
 
     Raises:
         ConfigurationError: No motion keeps the limits.
         CuttingError: A slice breaks down.
     """
-    adjoint, reach = SliceAdjoint(model, period), limits.amplitude(model)
-    height = model.top - model.bottom + CLEARANCE
-    low = np.array([0.0, limits.frequency[0], max(limits.press_speed[0], height / limits.duration)])
-    high = np.array([reach, limits.frequency[1], limits.press_speed[1]])
-    if (low > high).any():
-        raise ConfigurationError(
-            f"{height:.4g} m in {limits.duration:.4g} s need more than {high[2]:.4g} m/s",
-            field="press_speed",
-            fix="Allow more time or a greater speed.",
-        )
-    f, v = (float(np.sqrt(low[k] * high[k])) for k in (1, 2))
-    omega = 2.0 * np.pi * f
-    A = 0.5 * min(high[0], limits.draw_speed / omega, limits.draw_acceleration / omega**2)
-    start = PressAndDraw(press_speed=v, distance=height, amplitude=float(A), frequency=f)
-    # All three of the order of one.
-    scale = high
-    best: list = [np.inf, start]
-    count = 0
-
-    def motion_at(x: np.ndarray) -> PressAndDraw:
-        A, f, v = (np.clip(x * scale, low, high)).tolist()
-        return dc.replace(start, amplitude=A, frequency=f, press_speed=v, distance=height)
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal count
-        motion = motion_at(x)
-        value, slope = mean_force(adjoint, motion)
-        count += 1
-        if value < best[0] and all(g >= -1e-6 for g in _room(x * scale, limits)):
-            best[:] = value, motion
-        if progress is not None:
-            progress(count, best[0], best[1])
-        return value, slope * scale
-
-    x0 = np.array([getattr(start, name) for name in NAMES]) / scale
-    start_force = mean_force(adjoint, motion_at(x0))[0]
-    constraints = [
-        {"type": "ineq", "fun": lambda x, k=k: _room(x * scale, limits)[k]} for k in range(2)
-    ]
-    result = minimize(
-        objective,
-        x0,
-        jac=True,
-        method="SLSQP",
-        bounds=list(zip(low / scale, high / scale, strict=True)),
-        constraints=constraints,
-        options={"maxiter": iterations, "ftol": 1e-4},
-    )
-    force, motion = best
+    low, high = limits.ranges(model)
+    search = _Search(SliceAdjoint(model, period), limits, low, high, progress)
+    found = [search.begin(limits.motion(model, at), iterations) for at in places(starts)]
+    force, motion, converged = min(found, key=lambda each: each[0])
     values = np.array([getattr(motion, name) for name in NAMES])
-    press = dc.replace(motion, amplitude=0.0)
     active = [
         f"{name} {side}"
         for name, value, a, b in zip(NAMES, values, low, high, strict=True)
@@ -207,12 +240,62 @@ def optimize_motion(
     return Optimum(
         motion,
         force,
-        start_force,
-        mean_force(adjoint, press)[0],
-        count,
+        [each[0] for each in found],
+        search.first,
+        mean_force_alone(search.adjoint, dc.replace(motion, amplitude=0.0)),
+        search.count,
         active,
-        bool(result.success),
+        converged,
     )
+
+
+@dc.dataclass
+class _Search:
+    """The optimiser: how many slices it has simulated, the first one's force, and the best."""
+
+    adjoint: SliceAdjoint
+    limits: MotionLimits
+    low: np.ndarray
+    high: np.ndarray
+    progress: Callable[[int, float, PressAndDraw], None] | None
+    count: int = 0
+    first: float = np.nan
+    best: tuple[float, PressAndDraw] | None = None
+
+    def begin(self, start: PressAndDraw, iterations: int) -> tuple[float, PressAndDraw, bool]:
+        """Least force from a place, its motion, and whether the optimiser ended by itself."""
+        # All three of the order of one.
+        low, high, limits = self.low, self.high, self.limits
+        best: tuple[float, PressAndDraw] = (np.inf, start)
+
+        def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+            nonlocal best
+            values = np.clip(x * high, low, high)
+            motion = dc.replace(start, **dict(zip(NAMES, values.tolist(), strict=True)))
+            force, slope = mean_force(self.adjoint, motion)
+            if self.count == 0:
+                self.first = force
+            self.count += 1
+            if force < best[0] and all(g >= -1e-6 for g in _room(values, limits)):
+                best = force, motion
+            if self.best is None or best[0] < self.best[0]:
+                self.best = best
+            if self.progress is not None:
+                self.progress(self.count, *self.best)
+            return force, slope * high
+
+        result = minimize(
+            objective,
+            np.array([getattr(start, name) for name in NAMES]) / high,
+            jac=True,
+            method="SLSQP",
+            bounds=list(zip(low / high, np.ones(3), strict=True)),
+            constraints=[
+                {"type": "ineq", "fun": lambda x, k=k: _room(x * high, limits)[k]} for k in range(2)
+            ],
+            options={"maxiter": iterations, "ftol": 1e-4},
+        )
+        return *best, bool(result.success)
 
 
 def _room(values: np.ndarray, limits: MotionLimits) -> tuple[float, float]:

@@ -16,13 +16,14 @@ def optimize_scenario(
     scenario: Scenario,
     limits: MotionLimits,
     iterations: int = 30,
+    starts: int = 3,
     progress: Callable[[int, float, PressAndDraw], None] | None = None,
 ) -> tuple[Scenario, Optimum]:
     """Replaces a scenario's motion or policy by the best press and draw, for a robot to run.
 
     Args:
         scenario: A single cut of finite elements.
-        limits, iterations, progress: See `optimize_motion`.
+        limits, iterations, starts, progress: See `optimize_motion`.
 
     Returns:
         The scenario with the motion, a hold and a retraction; and the optimum.
@@ -44,6 +45,7 @@ def optimize_scenario(
         limits,
         period=scenario.exchange_period,
         iterations=iterations,
+        starts=starts,
         progress=progress,
     )
     # A robot starts and stops; and the edge starts above the food.
