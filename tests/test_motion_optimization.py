@@ -23,6 +23,7 @@ from sliceit_drake.cutting.motion_optimization import (
     places,
 )
 from sliceit_drake.diagrams.scenario import load_scenario
+from studies.learning import policy_and_motion
 
 NAMES = ("amplitude", "frequency", "press_speed")
 
@@ -117,6 +118,24 @@ def test_other_places_to_begin_at_leave_a_local_minimum(monkeypatch):
     counts, forces, _ = zip(*seen[once.evaluations :], strict=True)
     assert counts == tuple(range(1, often.evaluations + 1))
     assert list(forces) == sorted(forces, reverse=True)
+
+
+def test_evolution_finds_the_deepest_valley_within_the_limits(monkeypatch):
+    model, limits = model_of(), MotionLimits()
+    tried = []
+
+    def force(adjoint, motion):
+        tried.append(motion)
+        x, y = np.log(motion.frequency / 3.0), np.log(motion.press_speed / 0.02)
+        return 5.0 - 2.0 * np.exp(-(x**2) - y**2) + 20.0 * abs(motion.amplitude - 0.002)
+
+    monkeypatch.setattr(policy_and_motion, "mean_force_alone", force)
+    least, motion = policy_and_motion.evolve(SliceAdjoint(model, 0.002), limits)
+    assert least == pytest.approx(3.0, abs=0.1)
+    assert motion.frequency == pytest.approx(3.0, rel=0.15)
+    assert motion.press_speed == pytest.approx(0.02, rel=0.15)
+    assert len(tried) == 5 * 10 * 7
+    assert policy_and_motion.evolve(SliceAdjoint(model, 0.002), limits) == (least, motion)
 
 
 def test_places_to_begin_at_keep_the_limits():
