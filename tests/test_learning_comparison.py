@@ -20,6 +20,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning import unseen_worlds
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice, slice_metrics
 from sliceit_drake.learning.task import Limits
+from sliceit_drake.learning.model_card import model_card
 from sliceit_drake.learning.training_config import load_training
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
@@ -260,6 +261,20 @@ def test_a_shipped_correction_was_trained_as_its_file_says(seed):
     said = load_training(ROOT / "models/policies/correction.yaml")
     found = load_training(ROOT / f"models/policies/corrected_{seed}/training.yaml")
     assert dc.replace(said, seed=seed) == found
+
+
+def test_each_shipped_policy_has_the_card_that_its_training_leaves():
+    folders = sorted((ROOT / "models/policies").glob("*_[0-9]"))
+    assert len(folders) == 15
+    for folder in folders:
+        done = json.loads((folder / "summary.json").read_text())
+        file, found = folder / "validation.jsonl", None
+        if file.exists():
+            rows = map(json.loads, file.read_text().splitlines())
+            found = next(row for row in rows if row["steps"] == done["best_steps"])
+        config = load_training(folder / "training.yaml")
+        card = model_card(config, done["best_steps"], done["ends"], found)
+        assert card == (folder / "README.md").read_text(encoding="utf-8"), folder
 
 
 def test_a_trained_policy_runs_in_a_scenario():
