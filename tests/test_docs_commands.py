@@ -278,8 +278,8 @@ READ_ONLY = {
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
         python -m studies bands --laws slice_push bonds --draws 6
-        python -m studies calibration --foods cucumber potato --polish cucumber potato --steps 0 --starts 1 --point-steps 0 --output FOLDER
         python -m studies calibration --output FOLDER
+        python -m studies calibration --polish cucumber tomato potato --steps 0 --starts 1 --blocks 0 --point-steps 0 --output FOLDER
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 12 --output docs/results
         python -m studies disect --output docs/results
