@@ -19,8 +19,8 @@ from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning import unseen_worlds
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice, slice_metrics
-from sliceit_drake.learning.task import Limits
 from sliceit_drake.learning.model_card import model_card
+from sliceit_drake.learning.task import Limits
 from sliceit_drake.learning.training_config import load_training
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
