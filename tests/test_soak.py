@@ -61,6 +61,16 @@ def test_a_run_that_fails_is_found_with_its_last_words(tmp_path):
     assert any("result is not there" in text for text in lost)
 
 
+def test_a_date_may_change_and_nothing_else(tmp_path):
+    made = Soak(Job("write", (), ("result",)), tmp_path, seed=0)
+    runs = [soak.Run() for _ in range(3)]
+    texts = ("2026-11-27, force 1", "2026-11-28, force 1", "2026-11-28, force 2")
+    for text, one in zip(texts, runs, strict=True):
+        (tmp_path / "result").write_text(text)
+        made._compare(tmp_path, one)
+    assert [bool(one.lost) for one in runs] == [False, False, True]
+
+
 def test_memory_that_grows_from_run_to_run_is_found(tmp_path):
     made = soaked(tmp_path, seconds=1.0)
     for number, one in enumerate(made.runs):

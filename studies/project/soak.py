@@ -23,9 +23,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ from tqdm import tqdm
 from sliceit_drake.emulator.process import EmulatorProcess
 from studies.figures import BLUE, ORANGE, new_figure, save_figure, tidy
 from studies.pages import publish, render_and_store
-from studies.robot.faults import CLIENT_PACE, MOTION, PACE, await_rest
+from studies.robot.faults import CLIENT_PACE, MOTION, PACE, REST, SCENARIO, await_rest
 
 __all__ = ["Job", "Run", "Soak", "add_arguments", "run"]
 
@@ -152,7 +152,9 @@ class Soak:
             process.stdin.close()
             made.seconds = time.monotonic() - begin
             made.memory = max(made.memory, usage.ru_maxrss / 1024.0)
-            if process.returncode == -signal.SIGKILL and killed:
+            # It may have ended by itself at that moment.
+            killed = killed and process.returncode == -signal.SIGKILL
+            if killed:
                 made.kills += 1
             elif process.returncode != 0:
                 said.seek(0)
@@ -162,7 +164,7 @@ class Soak:
                 self._length = max(self._length, made.seconds)
         if left := _left_of(process.pid):
             made.lost.append(f"left behind: {', '.join(left)}")
-        return process.returncode == -signal.SIGKILL and killed
+        return killed
 
     def _compare(self, folder: Path, made: Run) -> None:
         for name in self.job.results:
@@ -206,7 +208,6 @@ def _left_of(session: int) -> list[str]:
         time.sleep(0.5)
 
 
-ROBOT = "scenarios/cucumber_spring.yaml"
 ADDRESS = "127.0.0.91"
 
 
@@ -215,12 +216,12 @@ def _emulator():  # type: ignore[no-untyped-def]
     """An emulated controller; gives what says whether its arm is at rest."""
     options = ["--set", f"{{{MOTION}}}"]
     with EmulatorProcess(
-        ROBOT, ADDRESS, PACE, lockstep=True, options=options, timeout=600.0
+        SCENARIO, ADDRESS, PACE, lockstep=True, options=options, timeout=600.0
     ) as emulator:
 
         def at_rest() -> list[str]:
             status = await_rest(emulator.pendant)
-            moves = np.abs(status["velocities"]).max() > 1e-3
+            moves = np.abs(status["velocities"]).max() > REST
             return ["the arm went on after its program was killed"] if moves else []
 
         yield at_rest
@@ -239,7 +240,7 @@ def jobs(records: Path) -> list[Job]:
     diagnose = ("diagnose", str(records), "--model", "cucumber", "--workers", "1")
     train = ("train", "--steps", "800", "--set", "warm_up=200,validation_interval=400")
     often = ("--set", "validation_slices=2,checkpoint_interval=200")
-    robot = ("hardware", ROBOT, "--set", f"{{{MOTION}}}", "--robot", "hardware/emulated.yaml")
+    robot = ("hardware", SCENARIO, "--set", f"{{{MOTION}}}", "--robot", "hardware/emulated.yaml")
     there = ("--host", ADDRESS, "--pace", str(CLIENT_PACE), "--no-replay")
     return [
         Job("simulate", (*SLICEIT, *simulate, *to), ("record.csv",)),
@@ -268,14 +269,18 @@ def run(options: argparse.Namespace) -> int:
             Soak(job, folder / job.name, options.seed + k) for k, job in enumerate(jobs(records))
         ]
         end = time.monotonic() + 60.0 * options.minutes
-        threads = [threading.Thread(target=soak.until, args=(end,)) for soak in soaks]
-        for thread in threads:
-            thread.start()
-        with tqdm(total=options.minutes, desc="minutes", bar_format="{l_bar}{bar}| {n:.1f}") as bar:
-            while any(thread.is_alive() for thread in threads):
+        with (
+            ThreadPoolExecutor(len(soaks)) as pool,
+            tqdm(total=options.minutes, desc="minutes", bar_format="{l_bar}{bar}| {n:.1f}") as bar,
+        ):
+            ends = [pool.submit(soak.until, end) for soak in soaks]
+            while not all(each.done() for each in ends):
                 time.sleep(1.0)
                 left = (end - time.monotonic()) / 60.0
                 bar.update(max(min(options.minutes - left, options.minutes) - bar.n, 0.0))
+        # What broke down in a thread does so here.
+        for each in ends:
+            each.result()
     lost = [text for soak in soaks for text in soak.lost()]
     rows = [
         (

@@ -44,7 +44,7 @@ from sliceit_drake.resources import resource_path
 from studies.pages import publish, render
 from studies.robot.fault_list import Case, cases
 
-__all__ = ["add_arguments", "measure", "page", "run"]
+__all__ = ["add_arguments", "await_rest", "measure", "page", "run"]
 
 SCENARIO = "scenarios/cucumber_spring.yaml"
 MOTION = """motion: {segments: [
@@ -158,6 +158,7 @@ def _output(process: subprocess.Popen, case: Case) -> str:
 
 
 def await_rest(pendant: PendantClient) -> dict:
+    """Status of the controller when its arm is at rest, or after `PATIENCE`."""
     end = time.monotonic() + PATIENCE
     while True:
         status = pendant.status()
