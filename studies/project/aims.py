@@ -110,6 +110,11 @@ class Docs:
         return found[0][len(first) :] if found else []
 
 
+def named(found: tuple[float, ...] | None, *names: str) -> dict[str, float]:
+    """What `Docs.numbers` found, by name; empty where it found nothing."""
+    return dict(zip(names, found, strict=True)) if found else {}
+
+
 def measured(
     what: str,
     aim: str,
@@ -155,7 +160,7 @@ def station(docs: Docs) -> tuple[Mapping[str, float], str]:
         "speed.md", r"runs at ([\d.]+) times real time, and at ([\d.]+) with the spring"
     )
     names = ("real_time_factor", "spring_real_time_factor")
-    return dict(zip(names, found or (), strict=False)), "speed.md"
+    return named(found, *names), "speed.md"
 
 
 def speed_rows(docs: Docs) -> Iterator[Row]:
@@ -215,7 +220,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
         ">= 2.4 times as fast",
         "python -m studies station_speed",
         page,
-        dict(zip(("ratio",), found or (), strict=False)),
+        named(found, "ratio"),
         lambda v: (f"{v['ratio']:g} times", v["ratio"] >= 2.4),
     )
     batch = docs.cells(page, "16", 4)
@@ -395,7 +400,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
             "<= half of DiSECt's",
             "python -m studies calibration --output FOLDER",
             source,
-            dict(zip(("ratio",), found or (), strict=False)),
+            named(found, "ratio"),
             lambda v: (f"{v['ratio']:.2f} of that half", v["ratio"] <= 1.0),
         )
         found = docs.numbers(source, rf"^\| {food} \| (\d+) \| (\d+) \| \d+ \| [\d.]+ \|$")
@@ -404,7 +409,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
             "<= 60 s and 300 s",
             f"python -m studies calibration_times --foods {timed}",
             source,
-            dict(zip(("first", "all"), found or (), strict=False)),
+            named(found, "first", "all"),
             lambda v: (
                 f"{v['first']:.0f} s, {v['all']:.0f} s",
                 v["first"] <= 60 and v["all"] <= 300,
@@ -416,7 +421,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
             ">= 90 %, <= 1.5 of the force",
             "python -m studies half_depth --output docs/figures/half_depth.png",
             source,
-            dict(zip(("inside", "width"), found or (), strict=False)),
+            named(found, "inside", "width"),
             lambda v: (
                 f"{v['inside']:.0f} %, {v['width']:g} of the force",
                 v["inside"] >= 90.0 and v["width"] <= 1.5,
@@ -428,7 +433,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
         "<= 2.7 N",
         "python -m studies calibration --output FOLDER",
         source,
-        dict(zip(("error",), found or (), strict=False)),
+        named(found, "error"),
         lambda v: (f"{v['error']:g} N", v["error"] <= 2.7),
     )
     for law in ("slice_push", "bonds"):
@@ -443,7 +448,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
                 "85 to 95 %, less than of a constant width",
                 "python -m studies bands --laws slice_push bonds --draws 6",
                 source,
-                dict(zip(("inside", "score", "constant"), found or (), strict=False)),
+                named(found, "inside", "score", "constant"),
                 lambda v: (
                     f"{v['inside']:.0f} %, {v['score']:g} N of {v['constant']:g} N",
                     85.0 <= v["inside"] <= 95.0 and v["score"] < v["constant"],
@@ -455,7 +460,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
         "hold the truth in 85 to 95 %",
         "python -m studies coverage --replicates 12 --output docs/results",
         "coverage.md",
-        dict(zip(("inside",), found or (), strict=False)),
+        named(found, "inside"),
         lambda v: (f"{v['inside']:g} %", 85.0 <= v["inside"] <= 95.0),
     )
 
@@ -542,7 +547,7 @@ def accuracy_rows(docs: Docs) -> Iterator[Row]:
         "none unexplained",
         "python -m studies random --count 200 --seed 1 --output docs/results",
         "random_slices.md",
-        dict(zip(names, counts or (), strict=False)),
+        named(counts, *names),
         lambda v: (
             ", ".join(f"{v[name]:.0f} {name}" for name in names),
             v["unexplained"] == 0.0 and sum(v.values()) >= 200,
@@ -664,7 +669,7 @@ def robot_rows(docs: Docs) -> Iterator[Row]:
         "all of >= 60",
         command,
         source,
-        dict(zip(("held", "faults"), found or (), strict=False)),
+        named(found, "held", "faults"),
         lambda v: (
             f"{v['held']:.0f} of {v['faults']:.0f}",
             v["held"] == v["faults"] and v["faults"] >= 60,
@@ -676,7 +681,7 @@ def robot_rows(docs: Docs) -> Iterator[Row]:
         "none of >= 200",
         command,
         source,
-        dict(zip(("stopped", "slices"), found or (), strict=False)),
+        named(found, "stopped", "slices"),
         lambda v: (
             f"{v['stopped']:.0f} of {v['slices']:.0f}",
             v["stopped"] == 0 and v["slices"] >= 200,
