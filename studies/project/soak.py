@@ -199,8 +199,8 @@ def _left_of(session: int) -> list[str]:
         left = []
         for file in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
-                state, _, _, of = file.read_text().rpartition(")")[2].split()[:4]
-                if int(of) == session and state != "Z":
+                state, _, _, of = file.read_bytes().rpartition(b")")[2].split()[:4]
+                if int(of) == session and state != b"Z":
                     words = (file.parent / "cmdline").read_bytes().split(b"\0")
                     left.append(b" ".join(words)[:120].decode("utf-8", "replace"))
         if not left or time.monotonic() > end:
