@@ -136,6 +136,9 @@ def test_evolution_finds_the_deepest_valley_within_the_limits(monkeypatch):
     assert motion.press_speed == pytest.approx(0.02, rel=0.15)
     assert len(tried) == 5 * 10 * 7
     assert policy_and_motion.evolve(SliceAdjoint(model, 0.002), limits) == (least, motion)
+    tried.clear()
+    assert policy_and_motion.drawn(SliceAdjoint(model, 0.002), limits) > least
+    assert len(tried) == 5 * 10 * 7
 
 
 def test_places_to_begin_at_keep_the_limits():

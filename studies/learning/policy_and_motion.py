@@ -5,7 +5,8 @@ as a policy took, and cut by a stiff position controller; the policy decides by 
 cut the same slices of the stand-in world, whose foods differ from the calibrated ones. Metrics are
 those of `sliceit evaluate`. The motion is the best of two searches, from `STARTS` places each: by
 the gradient (`sliceit optimize-motion`, at most 30 iterations from each) and by CMA-ES (Hansen
-2016; `GENERATIONS` of 7 slices from each).
+2016; `GENERATIONS` of `POPULATION` slices from each). As a control, as many motions as CMA-ES tries
+are drawn at random.
 """
 
 import argparse
@@ -38,7 +39,7 @@ from sliceit_drake.systems.compliance_controller import ComplianceControllerConf
 from sliceit_drake.systems.exported_network import load_network
 from studies.marked_page import Place
 
-__all__ = ["PLACE", "add_arguments", "evolve", "run"]
+__all__ = ["PLACE", "add_arguments", "drawn", "evolve", "run"]
 
 PLACE = Place("policy_and_motion")
 STIFF = "scenarios/cucumber_measured.yaml"
@@ -47,17 +48,19 @@ BELOW = 2e-4
 """How far below the board's top the motion aims, m."""
 
 
-STARTS, GENERATIONS = 5, 10
+STARTS, GENERATIONS, POPULATION = 5, 10, 7
 
 
 def evolve(adjoint: SliceAdjoint, limits: MotionLimits) -> tuple[float, PressAndDraw]:
     """Least mean force that CMA-ES finds from several places, N, and its motion."""
     best = (np.inf, limits.motion(adjoint.model, np.full(3, 0.5)))
     for seed, start in enumerate(places(STARTS)):
-        search = CMA(start, 0.2, bounds=np.array([[0.0, 1.0]] * 3), seed=seed)
+        search = CMA(
+            start, 0.2, bounds=np.array([[0.0, 1.0]] * 3), seed=seed, population_size=POPULATION
+        )
         for _ in range(GENERATIONS):
             tried = []
-            for shares in (search.ask() for _ in range(search.population_size)):
+            for shares in (search.ask() for _ in range(POPULATION)):
                 motion = limits.motion(adjoint.model, shares)
                 force = mean_force_alone(adjoint, motion)
                 best = min(best, (force, motion), key=lambda each: each[0])
@@ -66,17 +69,25 @@ def evolve(adjoint: SliceAdjoint, limits: MotionLimits) -> tuple[float, PressAnd
     return best
 
 
-def optimum(food: str, duration: float) -> tuple[PressAndDraw, float, float]:
-    """The best motion for a calibrated food in a time, s; least force by gradient and by CMA-ES."""
+def drawn(adjoint: SliceAdjoint, limits: MotionLimits) -> float:
+    """Least mean force of as many motions at random, N."""
+    shares = np.random.default_rng(0).random((STARTS * GENERATIONS * POPULATION, 3))
+    return min(mean_force_alone(adjoint, limits.motion(adjoint.model, each)) for each in shares)
+
+
+def optimum(food: str, duration: float) -> tuple[PressAndDraw, list[float]]:
+    """The best motion for a calibrated food in a time, s; least force of each search, N."""
     calibrated = load_calibrated_food(food)
     scenario = StandInWorld().scenario(food, 0)[0]
     model = make_food_model(calibrated.held(), calibrated.knife, scenario.numerics)
     limits = MotionLimits(duration=duration)
     period = scenario.exchange_period
     found = optimize_motion(model, limits, period=period, starts=STARTS)
-    force, motion = evolve(SliceAdjoint(model, period), limits)
+    adjoint = SliceAdjoint(model, period)
+    force, motion = evolve(adjoint, limits)
     motion = motion if force < found.force else found.motion
-    return dc.replace(motion, acceleration=limits.draw_acceleration), found.force, force
+    motion = dc.replace(motion, acceleration=limits.draw_acceleration)
+    return motion, [found.force, force, drawn(adjoint, limits)]
 
 
 def cut_by_motion(
@@ -144,8 +155,8 @@ def run(options: argparse.Namespace) -> int:
             cut = [cut_slice(copy.deepcopy(each), agent, decide).metrics for each in scenarios]
             # Without what it takes to come to the food and to wait for the goal.
             duration = float(np.median([each.duration for each in cut])) - 0.7
-            motion, by_gradient, by_evolution = optimum(food, max(duration, 1.0))
-            found.append((food, name, f"{by_gradient:.2f} N", f"{by_evolution:.2f} N"))
+            motion, forces = optimum(food, max(duration, 1.0))
+            found.append((food, name, *(f"{force:.2f} N" for force in forces)))
             planned = [cut_by_motion(each, motion, stiff) for each in scenarios]
             what = (
                 f"motion: {1e3 * motion.press_speed:.0f} mm/s down, {1e3 * motion.amplitude:.0f} mm"
