@@ -1,4 +1,4 @@
-"""Records whose force is a known function of one number of a cause, and that function in place of a
+"""Records whose force is a known function of numbers of a cause, and that function in place of a
 simulator: what is seen by derivatives, and what by simulation."""
 
 from collections.abc import Callable, Sequence
@@ -13,8 +13,8 @@ NOISE = 0.1
 TIME = np.arange(0.0, 3.0, 0.005)
 HELD = TIME > 2.0
 
-Force = Callable[[str, float], np.ndarray]
-"""Of a condition and a value of the cause's number, at `TIME`."""
+Force = Callable[..., np.ndarray]
+"""Of a condition and the values of the cause's numbers, at `TIME`."""
 
 
 def curve_record(
@@ -41,13 +41,18 @@ def curve_record(
 
 
 class CurveSimulation:
-    """Predicts a force at the values of a cause."""
+    """Predicts a force at the values of a cause's numbers."""
 
     model_with_food = object()
 
-    def __init__(self, records: Sequence[RecordSensitivity], force: Force) -> None:
+    def __init__(
+        self,
+        records: Sequence[RecordSensitivity],
+        force: Force,
+        numbers: Sequence[str] = ("exponent",),
+    ) -> None:
         self.conditions = [r.condition for r in records]
-        self.force = force
+        self.force, self.numbers = force, numbers
         self.targets = [SimpleNamespace(compare=lambda w: w[:, :1]) for _ in records]
         self.points: list[Point] = []
 
@@ -56,7 +61,7 @@ class CurveSimulation:
         self.points += points
         rows = []
         for point in points:
-            value = sum(float(active.values["exponent"]) for active in point.causes)
-            forces = [self.force(c, value) for c in self.conditions]
+            values = [sum(a.values[name] for a in point.causes) for name in self.numbers]
+            forces = [self.force(c, *values) for c in self.conditions]
             rows.append([SimpleNamespace(wrench=np.repeat(f[:, None], 6, axis=1)) for f in forces])
         return rows

@@ -4,9 +4,10 @@ import dataclasses as dc
 
 import numpy as np
 import pytest
-from curve_simulation import TIME, CurveSimulation, Force, curve_record
+from curve_simulation import HELD, TIME, CurveSimulation, Force, curve_record
 
 from sliceit_drake.diagnosis.causes.material import SlicePushLaw
+from sliceit_drake.diagnosis.causes.mounting import ArmCompliance
 from sliceit_drake.diagnosis.evidence.at_size import ROUNDS, AtSize
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation
@@ -17,6 +18,7 @@ from sliceit_drake.diagnosis.result import Diagnosis
 
 DRAWS = {"press": 0.0, "draw_1": 1.0, "draw_2": 2.0}
 COLUMN = Column("cause", "slice_push_law", "exponent", size=0.25, low=-1.0, high=2.0)
+SKIN = np.exp(-(((TIME - 0.2) / 0.1) ** 2))
 OTHERS = [Column("base", "material.toughness", size=0.05), Column("cause", "skin", "toughness")]
 
 
@@ -29,12 +31,11 @@ def force(condition: str, exponent: float) -> np.ndarray:
 
 def problem_of(hidden: float, column: Column = COLUMN) -> LinearProblem:
     """Records of a hidden exponent, beside a toughness of all and a skin."""
-    skin = np.exp(-(((TIME - 0.2) / 0.1) ** 2))
     records = []
     for condition in DRAWS:
         for k in range(3):
             r = curve_record(force, column, condition, k, hidden)
-            more = np.stack([0.05 * r.predicted[:, 0], skin], axis=1)[:, None]
+            more = np.stack([0.05 * r.predicted[:, 0], SKIN], axis=1)[:, None]
             columns = np.concatenate([r.columns, more], axis=2)
             even = np.concatenate([r.even, np.zeros_like(more)], axis=2)
             records.append(dc.replace(r, columns=columns, even=even))
@@ -98,6 +99,43 @@ def test_a_slice_that_breaks_down_there_keeps_its_derivatives():
     for before, after in zip(problem.found.records, verdict.problem.found.records, strict=True):
         same = np.array_equal(before.columns, after.columns)
         assert same == (before.condition != "draw_1")
+
+
+def pressed(condition: str, compliance: float, creep: float) -> np.ndarray:
+    """A board of 300 kN/m under an arm that gives, at once and more with time."""
+    given = compliance + creep * -np.expm1(-np.maximum(TIME - 2.0, 0.0) / 0.5)
+    return np.where(HELD, 8.0 / (1.0 + 3e5 * given), 8.0) * np.minimum(TIME / 0.3, 1.0)
+
+
+def pressed_problem(compliance: float, creep: float, columns: list[Column]) -> LinearProblem:
+    """Records of a board that is pressed; what a column does is what its size does."""
+    records = []
+    for k in range(6):
+        r = curve_record(lambda c, _: pressed(c, compliance, creep), COLUMN, "press", k, 0.0)
+        zero = pressed("press", 0.0, 0.0)
+        ends = [pressed("press", *(columns[i].size * np.eye(2)[i])) - zero for i in range(2)]
+        own = np.stack([0.05 * zero, *ends, SKIN], axis=1)[:, None]
+        records.append(dc.replace(r, predicted=zero[:, None], columns=own, even=np.zeros_like(own)))
+    return LinearProblem(Sensitivities([OTHERS[0], *columns, OTHERS[1]], records))
+
+
+def test_two_numbers_of_which_one_seems_absent_are_found_where_their_effect_saturates():
+    """By the whole size of one, the force falls three quarters; what is hidden is a tenth of it."""
+    columns = [
+        Column("cause", "arm_compliance", p.name, 0.5, p.size, p.unit, True, low=0.0, high=p.high)
+        for p in ArmCompliance.parameters
+    ]
+    hidden = 1e-6, 1.5e-6
+    problem = pressed_problem(*hidden, columns)
+    simulation = CurveSimulation(problem.found.records, pressed, ("compliance", "creep"))
+    at_size = AtSize(simulation, {"arm_compliance": ArmCompliance()})
+    before, after = (reach_verdict(problem, 60, at_size=a) for a in (None, at_size))
+    assert after.names == [["arm_compliance"]]
+    assert before.findings[0].evidence.coefficients[1] == 0.0
+    e = after.findings[0].evidence
+    found = [g * c.size for g, c in zip(e.coefficients, e.columns, strict=True)]
+    assert found == pytest.approx(hidden, rel=0.15)
+    assert after.own_error < 0.5 * before.own_error
 
 
 @pytest.fixture
