@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from curve_simulation import TIME, curve_record
 from synthetic_records import COLUMNS, NOISE, ROWS, SPEEDS, VARIATION, record
 
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
@@ -20,7 +21,13 @@ from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, foretells,
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.evidence.screen import screen
-from sliceit_drake.diagnosis.evidence.verdict import LAW, DecisionRule, Verdict, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import (
+    CLASS_ANGLE,
+    LAW,
+    DecisionRule,
+    Verdict,
+    reach_verdict,
+)
 from studies.hidden_effects.sizes import effect_in_noise
 
 
@@ -139,6 +146,30 @@ def test_two_hidden_causes_are_both_named():
     verdict = reach_verdict(problem(30, rate=2.5, fading_at_1p0=0.6), 60)
     assert verdict.kind == "causes"
     assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
+
+
+@pytest.mark.parametrize(("height", "names"), [(0.12, ["one", "other"]), (0.4, ["one"])])
+def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
+    """Their shapes are 20 degrees apart: that shows where the effect is large."""
+
+    def bump(at: float) -> np.ndarray:
+        return np.exp(-(((TIME - at) / 0.008) ** 2))
+
+    kinds = [
+        Column("base", "material.toughness", size=0.05),
+        Column("cause", "one", "height", size=0.2),
+        Column("cause", "other", "height", size=0.2),
+    ]
+    records, zero = [], np.full(len(TIME), 5.0)
+    own = np.stack([0.05 * zero, 0.2 * bump(1.0), 0.2 * bump(1.0028)], axis=1)[:, None]
+    for k in range(6):
+        r = curve_record(lambda *_: zero + height * bump(1.0), kinds[1], "press", k, 0.0)
+        records.append(dc.replace(r, predicted=zero[:, None], columns=own, even=np.zeros_like(own)))
+    whole = LinearProblem(Sensitivities(kinds, records))
+    verdict = reach_verdict(whole, 60)
+    first = verdict.screening.causes[0]
+    assert verdict.screening.angle_to(whole, first, "other") > CLASS_ANGLE
+    assert verdict.names == [names]
 
 
 def bounded(stands_for_rate: bool, rate: float = 2.5, skin: float = 2.5) -> LinearProblem:
