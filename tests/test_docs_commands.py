@@ -223,7 +223,7 @@ CI = """
 python3 -m venv .venv
 pip install -c constraints.txt -e '.[test]'
 pytest -n 2
-pytest -n 2 -m second_tier
+pytest -n 3 -m second_tier
 sphinx-build -W -c docs . output/docs
 """
 

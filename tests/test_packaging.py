@@ -43,7 +43,7 @@ def test_ci_runs_the_second_command_of_the_readme_and_then_the_second_tier():
     ]
     assert own == [
         "step .venv/bin/pip install -q -c constraints.txt -e '.[test,learn]'",
-        "step .venv/bin/pytest -n 2 -m second_tier",
+        "step .venv/bin/pytest -n 3 -m second_tier",
     ]
 
 
