@@ -24,6 +24,7 @@ from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.verdict import (
     CLASS_ANGLE,
     LAW,
+    STRONG,
     DecisionRule,
     Verdict,
     reach_verdict,
@@ -148,9 +149,8 @@ def test_two_hidden_causes_are_both_named():
     assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
 
 
-@pytest.mark.parametrize(("height", "names"), [(0.12, ["one", "other"]), (0.4, ["one"])])
-def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
-    """Their shapes are 20 degrees apart: that shows where the effect is large."""
+def bumps(height: float, apart: float, of_other: float = 0.0) -> LinearProblem:
+    """Records of bumps of two causes, the other's later by `apart`, s."""
 
     def bump(at: float) -> np.ndarray:
         return np.exp(-(((TIME - at) / 0.008) ** 2))
@@ -159,17 +159,33 @@ def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
         Column("base", "material.toughness", size=0.05),
         Column("cause", "one", "height", size=0.2),
         Column("cause", "other", "height", size=0.2),
+        Column("cause", "absent", "height", size=0.2),
     ]
     records, zero = [], np.full(len(TIME), 5.0)
-    own = np.stack([0.05 * zero, 0.2 * bump(1.0), 0.2 * bump(1.0028)], axis=1)[:, None]
+    one, other = bump(1.0), bump(1.0 + apart)
+    own = np.stack([0.05 * zero, 0.2 * one, 0.2 * other, 0.2 * bump(0.7)], axis=1)[:, None]
+    true = zero + height * one + of_other * other
     for k in range(6):
-        r = curve_record(lambda *_: zero + height * bump(1.0), kinds[1], "press", k, 0.0)
+        r = curve_record(lambda *_: true, kinds[1], "press", k, 0.0)
         records.append(dc.replace(r, predicted=zero[:, None], columns=own, even=np.zeros_like(own)))
-    whole = LinearProblem(Sensitivities(kinds, records))
+    return LinearProblem(Sensitivities(kinds, records))
+
+
+@pytest.mark.parametrize(("height", "names"), [(0.12, ["one", "other"]), (0.4, ["one"])])
+def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
+    """Their shapes are 20 degrees apart: that shows where the effect is large."""
+    whole = bumps(height, apart=0.0028)
     verdict = reach_verdict(whole, 60)
     first = verdict.screening.causes[0]
     assert verdict.screening.angle_to(whole, first, "other") > CLASS_ANGLE
     assert verdict.names == [names]
+
+
+def test_causes_that_do_nothing_in_common_are_two_findings_however_alike_their_evidence():
+    verdict = reach_verdict(bumps(0.14, apart=0.3, of_other=0.18), 60)
+    gains = [e.gain for e in verdict.screening.causes]
+    assert abs(gains[0] - gains[1]) < STRONG
+    assert sorted(verdict.names) == [["one"], ["other"]]
 
 
 def bounded(stands_for_rate: bool, rate: float = 2.5, skin: float = 2.5) -> LinearProblem:

@@ -25,6 +25,7 @@ __all__ = [
     "CLASS_ANGLE",
     "LAW",
     "LOCKED_TO_DEPTH",
+    "STRONG",
     "CauseVerdict",
     "DecisionRule",
     "Finding",
@@ -35,8 +36,11 @@ __all__ = [
 CLASS_ANGLE = 15.0
 """Causes that can do what was found to within this, degrees, are one group."""
 STRONG = 6.0
-"""Causes whose gains differ by less are one group: from here on, of twice the log-likelihood,
-evidence is called strong (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995)."""
+"""From this difference of gains on, of twice the log-likelihood, evidence is called strong (Kass
+and Raftery, J. Am. Stat. Assoc. 90, 1995)."""
+ALIKE_ANGLE = 60.0
+"""Causes that can do a quarter of the mean square of what was found, to within this angle, degrees,
+are of its group as well where the evidence between them is not strong."""
 LOCKED_TO_DEPTH = ("section_shape", "core", "skin")
 """Causes that are locked to depth alone, as the simulation's own law is."""
 OF_THE_BOARD = ("board_height", "board_stiffness")
@@ -424,7 +428,7 @@ def _may_be_law(problem: LinearProblem, e: CauseEvidence) -> bool:
 
 
 def _others(problem: LinearProblem, screening: Screening, best: CauseEvidence) -> list[str]:
-    """Causes that could do what was found, or gain as much to within what is no strong evidence."""
+    """Causes that could do what was found, or a part of it on evidence that is hardly weaker."""
     if best.per_record:
         return []
     out = [
@@ -432,10 +436,8 @@ def _others(problem: LinearProblem, screening: Screening, best: CauseEvidence) -
         for e in screening.causes
         if e.name != best.name
         and not e.per_record
-        and (
-            abs(best.gain - e.gain) < STRONG
-            or screening.angle_to(problem, best, e.name) <= CLASS_ANGLE
-        )
+        and screening.angle_to(problem, best, e.name)
+        <= (ALIKE_ANGLE if abs(best.gain - e.gain) < STRONG else CLASS_ANGLE)
     ]
     if _may_be_law(problem, best):
         locked = [n for n in LOCKED_TO_DEPTH if n != best.name and n in screening.names]
