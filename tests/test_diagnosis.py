@@ -149,22 +149,26 @@ def test_two_hidden_causes_are_both_named():
     assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
 
 
-def bumps(height: float, apart: float, of_other: float = 0.0) -> LinearProblem:
-    """Records of bumps of two causes, the other's later by `apart`, s."""
+def bump(at: float) -> np.ndarray:
+    return np.exp(-(((TIME - at) / 0.008) ** 2))
 
-    def bump(at: float) -> np.ndarray:
-        return np.exp(-(((TIME - at) / 0.008) ** 2))
 
-    kinds = [
-        Column("base", "material.toughness", size=0.05),
-        Column("cause", "one", "height", size=0.2),
-        Column("cause", "other", "height", size=0.2),
-        Column("cause", "absent", "height", size=0.2),
-    ]
+def two_causes(
+    one: float,
+    other: float,
+    shape: np.ndarray,
+    names: tuple[str, str] = ("one", "other"),
+    wrong: float = 0.0,
+) -> LinearProblem:
+    """Records with so much of a cause that is a bump at 1 s, of another of this shape, and of what
+    the simulation gets wrong along depth, N."""
+    kinds = [Column("base", "material.toughness", size=0.05)]
+    kinds += [Column("cause", name, "height", size=0.2) for name in (*names, "absent")]
     records, zero = [], np.full(len(TIME), 5.0)
-    one, other = bump(1.0), bump(1.0 + apart)
-    own = np.stack([0.05 * zero, 0.2 * one, 0.2 * other, 0.2 * bump(0.7)], axis=1)[:, None]
-    true = zero + height * one + of_other * other
+    shapes = 0.2 * bump(1.0), 0.2 * shape, 0.2 * bump(0.7)
+    own = np.stack([0.05 * zero, *shapes], axis=1)[:, None]
+    law = wrong * np.sin(3.0 * np.pi * TIME / TIME[-1])
+    true = zero + one * bump(1.0) + other * shape + law
     for k in range(6):
         r = curve_record(lambda *_: true, kinds[1], "press", k, 0.0)
         records.append(dc.replace(r, predicted=zero[:, None], columns=own, even=np.zeros_like(own)))
@@ -174,7 +178,7 @@ def bumps(height: float, apart: float, of_other: float = 0.0) -> LinearProblem:
 @pytest.mark.parametrize(("height", "names"), [(0.12, ["one", "other"]), (0.4, ["one"])])
 def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
     """Their shapes are 20 degrees apart: that shows where the effect is large."""
-    whole = bumps(height, apart=0.0028)
+    whole = two_causes(height, 0.0, bump(1.0028))
     verdict = reach_verdict(whole, 60)
     first = verdict.screening.causes[0]
     assert verdict.screening.angle_to(whole, first, "other") > CLASS_ANGLE
@@ -182,10 +186,20 @@ def test_causes_that_weak_evidence_does_not_part_are_one_group(height, names):
 
 
 def test_causes_that_do_nothing_in_common_are_two_findings_however_alike_their_evidence():
-    verdict = reach_verdict(bumps(0.14, apart=0.3, of_other=0.18), 60)
+    verdict = reach_verdict(two_causes(0.14, 0.18, bump(1.3)), 60)
     gains = [e.gain for e in verdict.screening.causes]
     assert abs(gains[0] - gains[1]) < STRONG
     assert sorted(verdict.names) == [["one"], ["other"]]
+
+
+@pytest.mark.parametrize(("wrong", "names"), [(0.2, []), (0.0, [["skin"]])])
+def test_where_the_law_is_wrong_what_is_locked_to_depth_has_to_gain_most(wrong, names):
+    """A ripple gains more, and is too small to be named."""
+    ripple = np.sin(40.0 * np.pi * TIME)
+    verdict = reach_verdict(two_causes(0.5, 0.05, ripple, ("skin", "ripple"), wrong), 60)
+    ripples, skin = verdict.screening.causes[:2]
+    assert ripples.name == "ripple" and ripples.gain > skin.gain > 200.0 and skin.size > 1.5
+    assert verdict.names == names
 
 
 def bounded(stands_for_rate: bool, rate: float = 2.5, skin: float = 2.5) -> LinearProblem:

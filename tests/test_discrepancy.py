@@ -209,18 +209,24 @@ def test_no_step_of_a_search_leaves_the_ranges_of_sizes(monkeypatch: pytest.Monk
 def test_what_is_found_of_it_is_its_mean_after_the_data(known: LinearProblem) -> None:
     sizes, model = some_sizes(3), known.with_causes([2])
     written = Written(known, sizes, model.shared, [VARIATION, 0.0])
-    wanted = written.own_error @ written.projection(model.prior[model.shared]) @ written.y
+    seen = written.own_error @ written.projection(model.prior[model.shared])
+    wanted = seen @ written.y
     found = OwnError(known, model, sizes)
     values = np.concatenate([v.T.ravel() for v in found.values])
     np.testing.assert_allclose(values, wanted, atol=1e-6 * np.abs(wanted).max())
-    # Its scale is the root mean square that it may have in a phase, where the knife touches.
-    variance = np.diag(written.own_error).reshape(4, 2, ROWS).transpose(0, 2, 1)
+    # Its scale is the root mean square that it has in a phase after the data, where the knife
+    # touches: of what was found and of how unsure that is.
+    after = np.diag(written.own_error - seen @ written.own_error)
+    variance = after.reshape(4, 2, ROWS).transpose(0, 2, 1)
     inside = np.array([r.in_contact for r in known.found.records])
     squares = np.concatenate([v[i] ** 2 for v, i in zip(found.values, inside, strict=True)]).mean(0)
-    more = np.maximum(squares, variance[inside].mean(0))
-    scale = found.scales()[0]
-    np.testing.assert_allclose(scale[inside[0]] ** 2, np.broadcast_to(more, (inside[0].sum(), 2)))
-    assert not scale[~inside[0]].any()
+    for scale, square in (
+        (found.scales(found=True)[0], squares),
+        (found.scales()[0], squares + variance[inside].mean(0)),
+    ):
+        wanted = np.broadcast_to(square, (inside[0].sum(), 2))
+        np.testing.assert_allclose(scale[inside[0]] ** 2, wanted, rtol=1e-6)
+        assert not scale[~inside[0]].any()
 
 
 def test_its_sizes_are_found_from_many_records() -> None:

@@ -160,6 +160,14 @@ def test_a_sensor_is_as_late_as_it_was_in_the_records_that_an_error_is_known_fro
     assert usual == pytest.approx(0.15) and less == pytest.approx(0.015)
 
 
+def test_a_simulation_is_wrong_by_a_tenth_beyond_what_is_known():
+    found = problem(3).found
+    alone, then = (LinearProblem(dc.replace(found, known_from=n)) for n in (0, 9))
+    away = then.discrepancy.prior.flat - alone.discrepancy.prior.flat
+    channels = len(found.records[0].channels)
+    np.testing.assert_allclose(away, [np.log(0.1)] * channels + [0.0] * (len(away) - channels))
+
+
 def test_slices_are_uneven_where_they_are_cut_and_not_on_the_bare_board():
     found = slices(11, 1.0).found
     first = found.records[0]

@@ -279,6 +279,28 @@ class Weighted:
             for covariates, g in zip(self.problem.factors, own, strict=True)
         ]
 
+    def covariances(self, fitted: Sequence[int], covariance: np.ndarray) -> list[np.ndarray]:
+        """Covariance, after the data, of the coefficients of each condition's shapes [z, z].
+
+        Args:
+            fitted: Numbers of other columns that are fitted beside them [k].
+            covariance: Of the coefficients of these [k, k].
+        """
+        z, s, D = len(self.problem.shapes), self.size, self.deviations[3]
+        beside = cho_solve(self.factor, self.shared[:s, [s + k for k in fitted]])
+        columns = [*range(z), *(z + k for k in fitted)]
+        out = []
+        for L, S, scale in zip(self.roots, self.solved, self.scales, strict=True):
+            # A condition's own part follows from all else, and adds what it is unsure of.
+            back = D[:, None] * dtrtrs(L, S[:, columns], lower=1, trans=1)[0]
+            shared = np.hstack([np.diag(part) for part in scale])
+            shared = shared - back[:, :z] @ shared
+            of_fitted = shared @ beside + back[:, z:]
+            of_shared = dtrtrs(self.factor[0], shared.T, lower=1)[0]
+            own = dtrtrs(L, np.diag(D), lower=1)[0]
+            out.append(of_shared.T @ of_shared + own.T @ own + of_fitted @ covariance @ of_fitted.T)
+        return out
+
     def products_of_record(
         self, rows: np.ndarray, condition: int, columns: np.ndarray
     ) -> np.ndarray:

@@ -1,5 +1,6 @@
 """How large an effect is, over the noise and over what the simulation gets wrong by itself."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,8 +38,8 @@ class OwnError:
 
     def __init__(self, problem: LinearProblem, model: Model, sizes: Sizes) -> None:
         self.problem, self.model, self.sizes = problem, model, sizes
-        weighted = problem.weighted(model, sizes)
-        theta, _ = fit_shared(weighted.total, model)
+        self._weighted = weighted = problem.weighted(model, sizes)
+        theta, self._covariance = fit_shared(weighted.total, model)
         self._fitted = np.zeros(len(weighted.total))
         self._fitted[-1], self._fitted[model.shared] = 1.0, -theta
         shape = len(PARTS), len(problem.noise), -1
@@ -65,25 +66,33 @@ class OwnError:
         out[problem.shapes] = -self.coefficients[number].sum(0).ravel()
         return out
 
+    @functools.cached_property
+    def covariances(self) -> np.ndarray:
+        """Of the shapes' coefficients in each condition and channel, after the data, where what is
+        fitted is unsure as well: a part of them may have been taken for a cause [C, c, n, n]."""
+        channels = len(self.problem.noise)
+        found = self._weighted.covariances(self.model.shared, self._covariance)
+        blocks = np.array(found).reshape(
+            len(found), channels, -1, channels, len(found[0]) // channels
+        )
+        return np.einsum("kcicj->kcij", blocks)
+
     def scales(self, found: bool = False) -> list[np.ndarray]:
         """Root mean square at the rows of each record in its channel and phase of the motion, over
         all records, where the knife touches; 0 elsewhere [m, c], N and Nm.
 
-        Of what was found or of what the sizes let it be, whichever is more: a part of it may have
-        been taken for a cause. With `found` of what was found alone.
+        Of what was found and of how unsure that is; with `found` of what was found alone.
         """
-        model = self.problem.discrepancy
-        deviations = self.sizes.deviations(model.channel, model.phase)
-        usual = []
-        for r, values in enumerate(self.problem.shape_values):
-            factors = np.append(model.factors[self.problem.condition_of[r]], 1.0)
-            by_shape = ((factors[:, None] * deviations) ** 2).sum(0)
-            usual.append((not found) * values**2 @ by_shape.reshape(len(self.problem.noise), -1).T)
-        squares = np.concatenate(self.values) ** 2, np.concatenate(usual)
-        out = np.zeros_like(squares[0])
-        for rows in self.problem.rows_by_phase:
-            out[rows] = np.sqrt(np.maximum(*(of[rows].mean(0) for of in squares)))
-        return np.split(out, np.cumsum([len(v) for v in usual])[:-1])
+        values = np.concatenate(self.values)
+        out = np.zeros_like(values)
+        for rows, products in zip(
+            self.problem.rows_by_phase, self.problem.shape_products, strict=True
+        ):
+            square = (values[rows] ** 2).mean(0)
+            if not found:
+                square += np.einsum("kcij,kij->c", self.covariances, products)
+            out[rows] = np.sqrt(square)
+        return np.split(out, np.cumsum([len(v) for v in self.values])[:-1])
 
     def over_scales(self) -> np.ndarray:
         """Gram matrices of the columns of each record, the residual last, over noise, own error and

@@ -67,6 +67,8 @@ that differs from record to record. Only more than that is a finding, or what sh
 the same in all records."""
 SAME_SENSOR = 0.1
 """Share of that by which a sensor differs from what it was in records that were there before."""
+SAME_LAW = 0.1
+"""The same of what the simulation gets wrong by itself, where that is known from such records."""
 FINE_MESH = 0.3
 """Standard deviation of the discretisation's error of each row, in that of the mesh column."""
 SECOND_ORDER = 0.5
@@ -206,6 +208,11 @@ class LinearProblem:
                 self.variation, self.uneven = by * self.variation, by * self.uneven
         else:
             self.variation = variation
+        if found.known_from:
+            # How uneven slices are is not known better.
+            prior = self.discrepancy.prior
+            prior = dc.replace(prior, channel=prior.channel + np.log(SAME_LAW))
+            self.discrepancy.prior = prior
         self._make_moments()
 
     def _usual(self) -> tuple[dict[int, float], dict[int, float]]:
@@ -358,6 +365,19 @@ class LinearProblem:
         labels = np.concatenate([r.phase.astype(str) for r in records])
         touching = np.concatenate([r.in_contact for r in records])
         return [np.flatnonzero(touching & (labels == p)) for p in np.unique(labels[touching])]
+
+    @functools.cached_property
+    def shape_products(self) -> list[np.ndarray]:
+        """Mean product of the shapes' values, two by two, over the rows of each `rows_by_phase`, in
+        parts by the condition that these are of, each [C, n, n]."""
+        values = np.concatenate(self.shape_values)
+        lengths = [len(v) for v in self.shape_values]
+        condition = np.repeat(self.condition_of, lengths)
+        out = []
+        for rows in self.rows_by_phase:
+            parts = (values[rows[condition[rows] == k]] for k in range(len(self.conditions)))
+            out.append(np.array([part.T @ part for part in parts]) / len(rows))
+        return out
 
     def apart_by(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation at each row by which slices that are cut alike differ, beside what

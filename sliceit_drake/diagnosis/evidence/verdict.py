@@ -377,10 +377,15 @@ def _refusal(
     inside = 1.0 if e.per_record else _share_in_contact(problem, e)
     wrong = OwnError.beside(problem, [*before, e.cause])
     least_wrong = 1.0 if before or problem.found.known_from else rule.right
-    wrong_by = 1.0 + inside * (max(_own_error(wrong)[1], least_wrong) - 1.0)
+    misfit = _own_error(wrong)[1]
+    wrong_by = 1.0 + inside * (max(misfit, least_wrong) - 1.0)
     least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
     if e.gain < least:
         return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
+    if e.name in LOCKED_TO_DEPTH and misfit >= rule.unknown:
+        first = max((o for o in screening.causes if not o.per_record), key=lambda o: o.gain)
+        if first.gain > e.gain:
+            return f"is locked to depth, as a law as wrong as this may be; {first.name} gains more"
     if before and e.gain < rule.left * (alone := gain_alone(problem, e.cause)):
         return f"gains {e.gain:.0f}, but {alone:.0f} without {', '.join(n for n, _ in before)}"
     if not e.per_record and not foretells(problem, e.cause, before, wrong):
