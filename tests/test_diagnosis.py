@@ -202,6 +202,24 @@ def test_where_the_law_is_wrong_what_is_locked_to_depth_has_to_gain_most(wrong, 
     assert verdict.names == names
 
 
+def test_a_number_that_the_own_error_may_stand_for_is_seen_once_the_others_are_in_the_model():
+    """One does much and the other little, both in shapes that the simulation may be wrong by."""
+    shapes = two_causes(0.0, 0.0, bump(1.3)).shape_values[0]
+    much = 3.0 * (shapes[:, 0] + shapes[:, 1] - shapes[:, 2])
+    little = 0.5 * shapes[:, 3:10] @ [1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
+    own = {"size": 1.0, "one_sided": True, "low": 0.0}
+    kinds = [Column("base", "material.toughness", size=0.05)]
+    kinds += [Column("cause", "arm", name, **own) for name in ("much", "little")]
+    records, zero = [], np.full(len(TIME), 5.0)
+    columns = np.stack([0.05 * zero, much, little], axis=1)[:, None]
+    for k in range(6):
+        r = curve_record(lambda *_: zero + much + little, kinds[1], "press", k, 0.0)
+        even = np.zeros_like(columns)
+        records.append(dc.replace(r, predicted=zero[:, None], columns=columns, even=even))
+    (arm,) = screen(LinearProblem(Sensitivities(kinds, records)), 20).causes
+    assert arm.coefficients == pytest.approx([1.0, 1.0], rel=0.03)
+
+
 def bounded(stands_for_rate: bool, rate: float = 2.5, skin: float = 2.5) -> LinearProblem:
     """A rate that is beyond its range, and a skin that acts as a part of it does, or is there."""
     found = problem(31, rate=rate, skin=0.0 if stands_for_rate else skin).found

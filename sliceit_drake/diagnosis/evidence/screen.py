@@ -175,12 +175,13 @@ class _Statistics:
         self.projected = beside(T, F, self.model.prior)
 
     def best(
-        self, products: np.ndarray, columns: list[int]
+        self, products: np.ndarray, columns: list[int], projected: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
         """Gains of measurements by a cause within the bounds of its numbers [n], the number of the
         set of its columns that gains most [n], and the sets."""
         kinds = [self.problem.found.columns[k] for k in columns]
-        A, b = self.projected[np.ix_(columns, columns)], products
+        projected = self.projected if projected is None else projected
+        A, b = projected[np.ix_(columns, columns)], products
         visible = np.diag(A) > 1e-9
         best, which = np.full(len(b), -1e3), np.zeros(len(b), int)
         sets: list[list[int]] = [[]]
@@ -200,6 +201,13 @@ class _Statistics:
                 best, which = np.where(better, gain, best), np.where(better, len(sets), which)
                 sets.append(active)
         return best, which, sets
+
+    def best_at(self, sizes: Sizes, columns: list[int]) -> list[int]:
+        """Those of a cause's columns that gain most at other sizes of the discrepancy."""
+        total = self.problem.weighted(self.model, sizes).total
+        projected = beside(total, self.model.shared, self.model.prior)
+        _, (which,), sets = self.best(projected[-1:, columns], columns, projected)
+        return [columns[i] for i in sets[which]]
 
     def own_gain(self, columns: list[int]) -> float:
         """Gain of a cause with numbers of its own in each record."""
@@ -331,6 +339,12 @@ def screen(
     for e in by_gain + [e for e in by_size if e not in by_gain]:
         _, scan, columns, active = chosen[e.name]
         anew, value = problem.fitted_sizes([*statistics.taken, *active], statistics.sizes)
+        if len(active) < len(columns):
+            # What a number does beside the others may have been taken for the own error.
+            more = statistics.best_at(anew, columns)
+            with_more = problem.fitted_sizes([*statistics.taken, *more], anew)
+            if with_more[1] > value:
+                active, (anew, value) = more, with_more
         gain = max(e.gain, 2.0 * (value - statistics.value))
         again = _evidence(statistics, e.name, gain, scan, columns, active, by_chance[e.name], anew)
         causes[causes.index(e)] = again
