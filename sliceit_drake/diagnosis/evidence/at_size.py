@@ -21,7 +21,7 @@ from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredicto
 
 __all__ = ["AtSize"]
 
-ROUNDS = 3
+ROUNDS = 4
 """Times that a cause is simulated at most."""
 CLOSE = 0.1
 """Share of a cause's numbers by which they may change without another simulation."""
