@@ -19,6 +19,7 @@ coefficients of variance D leave G - G[:, Z] (G[Z, Z] + D^-1)^-1 G[Z, :].
 """
 
 import dataclasses as dc
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -290,15 +291,17 @@ class Weighted:
         beside = cho_solve(self.factor, self.shared[:s, [s + k for k in fitted]])
         columns = [*range(z), *(z + k for k in fitted)]
         out = []
-        for L, S, scale in zip(self.roots, self.solved, self.scales, strict=True):
+        for L, S, scale, half in zip(
+            self.roots, self.solved, self.scales, self._shared_inverse[1], strict=True
+        ):
             # A condition's own part follows from all else, and adds what it is unsure of.
             back = D[:, None] * dtrtrs(L, S[:, columns], lower=1, trans=1)[0]
-            shared = np.hstack([np.diag(part) for part in scale])
-            shared = shared - back[:, :z] @ shared
-            of_fitted = shared @ beside + back[:, z:]
-            of_shared = dtrtrs(self.factor[0], shared.T, lower=1)[0]
+            left = np.eye(z) - back[:, :z]
+            shared = (scale[:, :, None] * beside.reshape(3, z, -1)).sum(0)
+            of_fitted = left @ shared + back[:, z:]
             own = dtrtrs(L, np.diag(D), lower=1)[0]
-            out.append(of_shared.T @ of_shared + own.T @ own + of_fitted @ covariance @ of_fitted.T)
+            out.append(left @ (half + half.T) @ left.T + own.T @ own)
+            out[-1] += of_fitted @ covariance @ of_fitted.T
         return out
 
     def products_of_record(
@@ -323,14 +326,13 @@ class Weighted:
         fitted = cho_solve(self.factor, self.shared[:s, s:] @ columns, check_finite=False)
         return np.asarray(left[:, z:] @ columns - scaled @ fitted)
 
-    def traces(self) -> list[np.ndarray]:
-        """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
-        `products` but with nothing else projected out."""
-        z, D, wide = len(self.problem.shapes), self.deviations[3], self.deviations[:3]
-        # With P the inverse of E + B, E nearly 1, B - B P B has the diagonal of E - E P E.
+    @functools.cached_property
+    def _shared_inverse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance, after the data, of the coefficients that conditions share, each over its
+        standard deviation: its lower triangle [3 z, 3 z]. And half of the covariance of their sum
+        in each condition, to which its transpose adds the other half [C, z, z]."""
+        z, wide = len(self.problem.shapes), self.deviations[:3]
         P, _ = dpotri(self.factor[0], lower=1)
-        E = 1.0 + JITTER * (1.0 + np.diag(self.shared)[: self.size])
-        out = [E - E * np.diag(P) * E]
         blocks = P.reshape(3, z, 3, z)
         pairs = np.empty((len(FIRST), z, z))
         for pair, a, b in zip(pairs, FIRST, SECOND, strict=True):
@@ -340,8 +342,18 @@ class Weighted:
         pairs[FIRST == SECOND] *= 1.0 - 0.5 * np.eye(z)
         F = np.array(self.problem.factors)
         among = (F[:, FIRST] * F[:, SECOND]) @ pairs.reshape(len(pairs), -1)
+        return P, among.reshape(len(F), z, z)
+
+    def traces(self) -> list[np.ndarray]:
+        """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
+        `products` but with nothing else projected out."""
+        z, D = len(self.problem.shapes), self.deviations[3]
+        # With P the inverse of E + B, E nearly 1, B - B P B has the diagonal of E - E P E.
+        P, among = self._shared_inverse
+        E = 1.0 + JITTER * (1.0 + np.diag(self.shared)[: self.size])
+        out = [E - E * np.diag(P) * E]
         ZZ = self.of_condition[:, :z, :z]
-        products = among.reshape(len(F), z, z) @ (ZZ * D)
+        products = among @ (ZZ * D)
         for A, product in zip(ZZ, products, strict=True):
             out.append(D * D * np.diag(A) - 2.0 * D * (A * product).sum(0))
         return out
