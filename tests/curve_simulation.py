@@ -61,7 +61,7 @@ class CurveSimulation:
         self.points += points
         rows = []
         for point in points:
-            values = [sum(a.values[name] for a in point.causes) for name in self.numbers]
+            values = [sum(a.values.get(name, 0.0) for a in point.causes) for name in self.numbers]
             forces = [self.force(c, *values) for c in self.conditions]
             rows.append([SimpleNamespace(wrench=np.repeat(f[:, None], 6, axis=1)) for f in forces])
         return rows

@@ -7,7 +7,7 @@ import pytest
 from curve_simulation import HELD, TIME, CurveSimulation, Force, curve_record
 
 from sliceit_drake.diagnosis.causes.material import SlicePushLaw
-from sliceit_drake.diagnosis.causes.mounting import ArmCompliance
+from sliceit_drake.diagnosis.causes.mounting import ArmCompliance, BoardHeight, BoardLaw
 from sliceit_drake.diagnosis.evidence.at_size import ROUNDS, AtSize
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation
@@ -136,6 +136,47 @@ def test_two_numbers_of_which_one_seems_absent_are_found_where_their_effect_satu
     found = [g * c.size for g, c in zip(e.coefficients, e.columns, strict=True)]
     assert found == pytest.approx(hidden, rel=0.15)
     assert after.own_error < 0.5 * before.own_error
+
+
+BOARD = [
+    Column("cause", cause.name, p.name, size=p.size, unit=p.unit, low=p.low, high=p.high)
+    for cause in (BoardHeight, BoardLaw)
+    for p in cause.parameters
+]
+ENDS = {"onto": 5e-5, "into": 1.5e-4, "far into": 3e-4}
+"""How far into the board the knife is driven, metres."""
+
+
+def on_board(
+    condition: str, height: float = 0.0, share: float = 0.0, exponent: float = 0.0
+) -> np.ndarray:
+    """A cut that ends in a board of 100 kN/m, which may lie higher or be stiffer."""
+    depth = np.minimum(TIME / 2.0, 1.0) * (0.02 + ENDS[condition])
+    board = 1e5 * np.maximum(depth + height - 0.02, 0.0) * (1.0 + share)
+    stiffer = np.where(board > 0.0, (np.maximum(board, 1e-9) / 5.0) ** exponent, 1.0)
+    return 4.0 * np.minimum(TIME / 0.3, 1.0) + board * stiffer
+
+
+def test_a_board_that_lies_higher_is_simulated_where_a_stiffer_one_explains_nearly_as_much():
+    """A height's column is the mean of what 0.2 mm do up and down: down, nothing is touched."""
+    records = []
+    for k, condition in enumerate([*ENDS] * 3):
+        r = curve_record(lambda c, _: on_board(c, 8e-5), COLUMN, condition, k, 0.0)
+        zero = on_board(condition)
+        own = [0.05 * zero]
+        for step in np.diag([c.size for c in BOARD]):
+            own.append(0.5 * (on_board(condition, *step) - on_board(condition, *-step)))
+        columns = np.stack([*own, SKIN], axis=1)[:, None]
+        new = dict(predicted=zero[:, None], columns=columns, even=np.zeros_like(columns))
+        records.append(dc.replace(r, **new))
+    problem = LinearProblem(Sensitivities([OTHERS[0], *BOARD, OTHERS[1]], records))
+    simulation = CurveSimulation(records, on_board, [c.parameter for c in BOARD])
+    at_size = AtSize(simulation, {c.name: c() for c in (BoardHeight, BoardLaw)})
+    before, after = (reach_verdict(problem, 60, at_size=a) for a in (None, at_size))
+    found = [v.screening.evidence("board_height").coefficients[0] * 2e-4 for v in (before, after)]
+    assert found[0] > 1.2e-4
+    assert found[1] == pytest.approx(8e-5, rel=0.02)
+    assert after.names[0][0] == "board_height"
 
 
 @pytest.fixture

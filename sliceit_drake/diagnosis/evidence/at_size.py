@@ -45,15 +45,17 @@ class AtSize:
         self.predictor, self.causes, self.progress = predictor, causes, progress
         self._simulated: dict[CauseAtScan, list[np.ndarray]] = {}
 
-    def __call__(self, problem: LinearProblem, e: CauseEvidence) -> LinearProblem | None:
+    def __call__(
+        self, problem: LinearProblem, e: CauseEvidence, contested: bool = False
+    ) -> LinearProblem | None:
         """The problem with the columns of a cause corrected; None where that is not needed: what is
-        within a size of a derivative, or was simulated near what was found. A column of one side is
-        no derivative but what its whole size does."""
+        within a size of a derivative, unless another explains nearly as much, or was simulated near
+        what was found. A column of one side is no derivative but what its whole size does."""
         step, before = self._step(problem, e), self._simulated.setdefault(e.cause, [])
         near = before and np.linalg.norm(step - before[-1]) < CLOSE * np.linalg.norm(step)
         own = problem.found.of_causes([e.cause])
         one_sided = np.array([problem.found.columns[k].one_sided for k in own])
-        within = np.abs(step).max() <= 1.0 and not step[one_sided].any()
+        within = not contested and np.abs(step).max() <= 1.0 and not step[one_sided].any()
         if within or len(before) == ROUNDS or near:
             return None
         before.append(step)

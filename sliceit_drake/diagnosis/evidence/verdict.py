@@ -46,6 +46,8 @@ LOCKED_TO_DEPTH = ("section_shape", "core", "skin")
 OF_THE_BOARD = ("board_height", "board_stiffness")
 """Causes of which one is named: a board that lies higher is pressed to where its law was not
 measured, and then seems to be of another stiffness as well."""
+RIVAL = 0.5
+"""Least share of the largest gain from which on the other cause of the board is simulated too."""
 HALF = 0.5
 """Least share of the simulation's own error that a cause can do which is said to be near."""
 LIKE_LAW = (("in", "shared"), ("any", "shared"))
@@ -234,12 +236,10 @@ def reach_verdict(
         assumed = [e.cause for e in (*(f.evidence for f in findings), *aside)]
         screening = screen(problem, replicates, seed + len(findings), assumed, progress)
         if at_size is not None and screening.p_value <= rule.alarm:
-            first = max(screening.causes, key=lambda e: e.gain)
-            if first.score > 0.0 and not first.per_record:
-                corrected = at_size(problem, first)
-                if corrected is not None:
-                    problem = corrected
-                    continue
+            corrected = _at_size(problem, screening, at_size)
+            if corrected is not None:
+                problem = corrected
+                continue
         screenings.append(screening)
         # Beside what is only set aside nothing is excluded.
         if not aside:
@@ -310,6 +310,22 @@ def reach_verdict(
         max(needed, 0),
         trend,
     )
+
+
+def _at_size(problem: LinearProblem, screening: Screening, at_size: AtSize) -> LinearProblem | None:
+    """The problem with the columns of what gains most corrected, and of its rival where both are of
+    the board: which of them it is shows where the board is only just touched, and there the column
+    of a height is the mean of what it does up and down. None where none has to be."""
+    first, *rest = sorted(screening.causes, key=lambda e: -e.gain)
+    likely = [first]
+    if first.name in OF_THE_BOARD:
+        likely += [e for e in rest if e.name in OF_THE_BOARD and e.gain >= RIVAL * first.gain]
+    for e in likely:
+        if e.score > 0.0 and not e.per_record:
+            corrected = at_size(problem, e, contested=len(likely) > 1)
+            if corrected is not None:
+                return corrected
+    return None
 
 
 def _named(findings: Sequence[Finding]) -> str:
