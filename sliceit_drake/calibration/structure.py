@@ -227,96 +227,136 @@ def choose_structure(
         ConfigurationError: A record cannot be predicted.
         CuttingError: Nothing that was tried can be cut.
     """
-    plain = _without_elements(setup)
-    first = coarse_predictor(plain, records, workers)
-    height = max(t.facts.height for t in first.targets)
-    free = all(r.metadata.food.support == "unknown" for r in records)
-    elements = _elements(setup, height, free)
-    lines, warnings = puncture_lines(setup, first.targets), []
-    done, tried = 0, 1 + FITTED
+    search = _Search(setup, records, workers, progress)
+    while search.takes_another():
+        pass
+    search.say_what_is_left()
+    search.compare_with_given()
+    found = search.current
+    return StructureChoice(found.setup, found.values, search.taken, search.lines, search.warnings)
 
-    def show(best: float) -> None:
-        if progress is not None:
-            progress(done, max(tried, done), best)
 
-    minima = _best_first([_fit(first, plain, start) for start in first_starts(first)])
-    if not minima:
-        raise CuttingError("no start of the plainest structure could be cut; widen the ranges")
-    current = minima[0]
-    done = 1
-    show(current.rms)
-    lines.append(
-        f"Plain food: {current.rms:.3f} N on the records, {current.left_out:.3f} N on left-out "
-        "depth"
-    )
-    taken: list[str] = []
-    rest = list(elements)
-    last: dict[str, _Fitted] = {}
-    promised: dict[str, float] = {}
-    while rest:
-        able = [e for e in rest if not e.needs or e.needs in taken]
+class _Search:
+    """What a nested comparison has found so far; arguments as `choose_structure`.
+
+    Attributes:
+        current: The best structure.
+        taken: Names of its elements.
+        lines, warnings: As in `StructureChoice`.
+    """
+
+    def __init__(
+        self,
+        setup: CalibrationSetup,
+        records: Sequence[SliceRecord],
+        workers: int | None,
+        progress: Progress | None,
+    ) -> None:
+        self._setup, self._records, self._workers = setup, records, workers
+        self._progress = progress
+        plain = _without_elements(setup)
+        first = coarse_predictor(plain, records, workers)
+        height = max(t.facts.height for t in first.targets)
+        free = all(r.metadata.food.support == "unknown" for r in records)
+        self._elements = _elements(setup, height, free)
+        self._minima = _best_first([_fit(first, plain, start) for start in first_starts(first)])
+        if not self._minima:
+            raise CuttingError("no start of the plainest structure could be cut; widen the ranges")
+        self.current = self._minima[0]
+        self.taken: list[str] = []
+        self.warnings: list[str] = []
+        self.lines = puncture_lines(setup, first.targets)
+        self.lines.append(
+            f"Plain food: {self.current.rms:.3f} N on the records, {self.current.left_out:.3f} N "
+            "on left-out depth"
+        )
+        self._promised: dict[str, float] = {}
+        self._last: dict[str, _Fitted] = {}
+        self._done, self._in_all = 1, 1 + FITTED
+        self._show(self.current.rms)
+
+    def _show(self, best: float) -> None:
+        if self._progress is not None:
+            self._progress(self._done, max(self._in_all, self._done), best)
+
+    def takes_another(self) -> bool:
+        """Takes the element that predicts left-out depth best, if that gains enough."""
+        fits = self._fits()
+        by_name = {name: _best_first(own) for name, own in fits.items()}
+        found = self._last = {name: own[0] for name, own in by_name.items() if own}
+        gains = {n: 1.0 - f.left_out / self.current.left_out for n, f in found.items()}
+        best = max(gains, key=lambda n: gains[n], default=None)
+        if best is None or gains[best] < GAIN:
+            return False
+        for other, fit in found.items():
+            if other != best and fit.left_out < (1.0 + ALIKE) * found[best].left_out:
+                self.warnings += _alike(best, found[best], other, fit)
+        change = _change(self.current, found[best])
+        self.lines.append(f"{best}: taken. {change}{_layer(best, found[best].values)}")
+        self.current, self._minima = found[best], by_name[best]
+        self.taken.append(best)
+        self._in_all = self._done + FITTED
+        return len(self.taken) < len(self._elements)
+
+    def _fits(self) -> dict[str, list[_Fitted | None]]:
+        """Fits of the elements that promise most, from the best of what was found, by name."""
         trials: list[_Trial] = []
-        for element in able:
-            wider = _with_element(current.setup, element)
-            predictor = coarse_predictor(wider, records, workers)
-            own = _trials(element, wider, predictor, minima)
-            promised[element.name] = max([t.promise for t in own], default=0.0)
+        for element in self._elements:
+            if element.name in self.taken or (element.needs and element.needs not in self.taken):
+                continue
+            wider = _with_element(self.current.setup, element)
+            predictor = coarse_predictor(wider, self._records, self._workers)
+            own = _trials(element, wider, predictor, self._minima)
+            self._promised[element.name] = max([t.promise for t in own], default=0.0)
             trials += own[:OF_ONE]
         trials.sort(key=lambda t: -t.promise)
         fits: dict[str, list[_Fitted | None]] = {}
+        best = self.current.rms
         for trial in [t for t in trials[:FITTED] if t.promise > 0.5 * GAIN]:
-            fits.setdefault(trial.element.name, []).append(
-                _fit(trial.predictor, trial.setup, trial.start)
-            )
-            done += 1
-            show(min([current.rms, *(f.rms for own in fits.values() for f in own if f)]))
-        by_name = {name: _best_first(own) for name, own in fits.items()}
-        found = last = {name: own[0] for name, own in by_name.items() if own}
-        gains = {n: 1.0 - f.left_out / current.left_out for n, f in found.items()}
-        best = max(gains, key=lambda n: gains[n], default=None)
-        if best is None or gains[best] < GAIN:
-            break
-        others = [n for n in gains if n != best]
-        for other in others:
-            if found[other].left_out < (1.0 + ALIKE) * found[best].left_out:
-                warnings += _alike(best, found[best], other, found[other])
-        lines.append(
-            f"{best}: taken. {_change(current, found[best])}{_layer(best, found[best].values)}"
-        )
-        current, minima = found[best], by_name[best]
-        taken.append(best)
-        rest = [e for e in rest if e.name != best]
-        tried = done + FITTED
-    for element in elements:
-        if element.name in taken:
-            continue
-        if element.name in last:
-            lines.append(f"{element.name}: left. {_change(current, last[element.name])}")
-        elif element.needs and element.needs not in taken:
-            lines.append(f"{element.name}: left, without {element.needs} it is nothing")
-        else:
-            lines.append(
-                f"{element.name}: left. A slice with it promises "
-                f"{100.0 * max(promised[element.name], 0.0):.0f} % on left-out depth"
-            )
-    given = _elements_of(setup, elements)
-    if given and set(given) != set(taken):
+            fit = _fit(trial.predictor, trial.setup, trial.start)
+            fits.setdefault(trial.element.name, []).append(fit)
+            best = best if fit is None else min(best, fit.rms)
+            self._done += 1
+            self._show(best)
+        return fits
+
+    def say_what_is_left(self) -> None:
+        """Adds a line on each element that was not taken."""
+        for element in self._elements:
+            name = element.name
+            if name in self.taken:
+                continue
+            if name in self._last:
+                why = _change(self.current, self._last[name])
+                self.lines.append(f"{name}: left. {why}")
+            elif element.needs and element.needs not in self.taken:
+                self.lines.append(f"{name}: left, without {element.needs} it is nothing")
+            else:
+                promise = 100.0 * max(self._promised[name], 0.0)
+                self.lines.append(
+                    f"{name}: left. A slice with it promises {promise:.0f} % on left-out depth"
+                )
+
+    def compare_with_given(self) -> None:
+        """Takes the setup's own food instead, if that predicts left-out depth as well on the
+        setup's mesh."""
+        given = _elements_of(self._setup, self._elements)
+        if not given or set(given) == set(self.taken):
+            return
         named = f"The setup's own food, with {' and '.join(given)}"
-        fine = _fit(
-            coarse_predictor(current.setup, records, workers, 1.0), current.setup, current.values
-        )
-        whole = _as_given(setup, records, workers)
+        setup, values = self.current.setup, self.current.values
+        fine = _fit(coarse_predictor(setup, self._records, self._workers, 1.0), setup, values)
+        whole = _as_given(self._setup, self._records, self._workers)
         if fine is not None and whole is not None and _disagrees(fine, whole):
             fine, whole = _refitted(fine), _refitted(whole)
         if whole is None:
-            lines.append(f"{named}: left, its slices break down")
+            self.lines.append(f"{named}: left, its slices break down")
         elif fine is not None and whole.left_out > (1.0 - GAIN) * fine.left_out:
-            lines.append(f"{named}: left. {_change(fine, whole)}")
+            self.lines.append(f"{named}: left. {_change(fine, whole)}")
         else:
             change = "" if fine is None else f" On the setup's mesh: {_change(fine, whole)}"
-            lines.append(f"{named}: taken instead.{change}")
-            current, taken, warnings = whole, given, []
-    return StructureChoice(current.setup, current.values, taken, lines, warnings)
+            self.lines.append(f"{named}: taken instead.{change}")
+            self.current, self.taken, self.warnings = whole, given, []
 
 
 def _elements_of(setup: CalibrationSetup, elements: Sequence[_Element]) -> list[str]:
