@@ -267,36 +267,13 @@ def reach_verdict(
     named_causes = [f.evidence.cause for f in findings]
     wrong, misfit, mostly = _own_error(OwnError.beside(problem, named_causes))
     causes = _verdicts(judged, findings, refused, rule)
-    shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
     if not named and misfit >= rule.unknown and mostly[0][1:3] in LIKE_LAW:
         findings = _nearest(problem, screenings[0])
     trend = trend_of_slices(problem, [f.evidence.cause for f in findings if named], seed=seed)
     if trend is not None and (trend.p_value > rule.alarm or trend.size < rule.trend):
         trend = None
-    few = f"no condition has {rule.replicates} slices, so that"
-    if not named and not (needed and findings):
-        if misfit >= rule.unknown and needed:
-            kind, reason = "nothing", f"{few} what is left cannot be told from how slices vary"
-        elif misfit >= rule.unknown:
-            kind, reason = "unknown", f"{shown}, mostly {_words(mostly)}, "
-            if findings:
-                reason += "which may be its law as well as shape, core or skin"
-                more = [n for n in findings[0].others if n not in (*LOCKED_TO_DEPTH, LAW)]
-                reason += "".join(f", or {name}" for name in more)
-            else:
-                reason += "and no cause of the list explains it"
-        elif trend is not None:
-            kind = "unknown"
-            reason = f"{trend.channel} goes with the number of the slice, in no form of the list"
-        else:
-            kind = "nothing"
-            reason = "nothing beyond the noise and what the simulation is unsure of"
-    elif needed:
-        kind = "too_few_replicates"
-        reason = f"{few} an effect cannot be told from how slices vary"
-    else:
-        kind = "cause" if len(findings) == 1 else "causes"
-        reason = f"{_named(findings)}; beside that {shown}, mostly {_words(mostly)}"
+    own = wrong, misfit, mostly
+    kind, reason = _in_words(findings, named, needed, own, trend, rule)
     return Verdict(
         kind,
         findings,
@@ -326,6 +303,47 @@ def _at_size(problem: LinearProblem, screening: Screening, at_size: AtSize) -> L
             if corrected is not None:
                 return corrected
     return None
+
+
+def _in_words(
+    findings: Sequence[Finding],
+    named: bool,
+    needed: int,
+    own_error: tuple[float, float, list[tuple[str, str, str, float]]],
+    trend: Trend | None,
+    rule: DecisionRule,
+) -> tuple[str, str]:
+    """Kind of a verdict, and its reason in a sentence.
+
+    Args:
+        findings: With the one that comes nearest where none is named.
+        named: Whether they are named.
+        needed: Replicates of each condition that are missing.
+        own_error: As `_own_error`.
+        trend: As in `Verdict`.
+        rule: When a cause is named.
+    """
+    wrong, misfit, mostly = own_error
+    shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
+    few = f"no condition has {rule.replicates} slices, so that"
+    if named and not needed:
+        kind = "cause" if len(findings) == 1 else "causes"
+        return kind, f"{_named(findings)}; beside that {shown}, mostly {_words(mostly)}"
+    if needed and findings:
+        return "too_few_replicates", f"{few} an effect cannot be told from how slices vary"
+    if needed and misfit >= rule.unknown:
+        return "nothing", f"{few} what is left cannot be told from how slices vary"
+    if misfit >= rule.unknown:
+        reason = f"{shown}, mostly {_words(mostly)}, "
+        if not findings:
+            return "unknown", reason + "and no cause of the list explains it"
+        reason += "which may be its law as well as shape, core or skin"
+        more = [n for n in findings[0].others if n not in (*LOCKED_TO_DEPTH, LAW)]
+        return "unknown", reason + "".join(f", or {name}" for name in more)
+    if trend is not None:
+        goes = f"{trend.channel} goes with the number of the slice"
+        return "unknown", f"{goes}, in no form of the list"
+    return "nothing", "nothing beyond the noise and what the simulation is unsure of"
 
 
 def _named(findings: Sequence[Finding]) -> str:
