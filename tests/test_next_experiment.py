@@ -76,7 +76,7 @@ class Bench:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     # The class is found in this session; docs/results/hidden_effects.md says how often it is.
     folder = tmp_path_factory.mktemp("bench")
-    records = load_sessions([cut(POOR, folder / "old", 21)])
+    records = load_sessions([cut(POOR, folder / "old", 22)])
     diagnosis = diagnosis_of(sensitivities(SETUP, records, CAUSES, workers=2))
     with pytest.MonkeyPatch.context() as patch:
         # The whole menu would take a minute.

@@ -617,6 +617,18 @@ def test_a_tougher_slice_of_higher_food_cuts_harder_and_earlier():
     assert contact[0] - contact[1] == pytest.approx(first.height - second.height, abs=2e-4)
 
 
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_taller_slice_lies_on_the_board_as_well(world):
+    session = Session(bench("push"), [], world, 1, COARSE)
+    session.specimens[0] = dc.replace(session.specimens[0], height=1e-3)
+    taller, plain = session.series(0)[0], series(world=world)
+    inside = during(plain, "slice", "through") & (plain.depth > 0.0)
+    share = plain.p_true[inside, 2] / plain.slice.height
+    assert share[0] > 0.95 and share[-1] < 0.1
+    farther = (taller.depth - plain.depth)[inside]
+    np.testing.assert_allclose(farther, 1e-3 * share, atol=3e-5)
+
+
 def test_noise_is_correlated_in_time_and_has_its_standard_deviation():
     sensor = dc.replace(IDEAL, force_noise=0.2, correlated_share=0.5, correlation_time=0.05)
     _, readings = measured(np.zeros((40000, 6)), 2e-3, sensor, np.random.default_rng(2))

@@ -51,8 +51,8 @@ RECORD_EFFECTS = (
     RecordEffect("friction", "", 0.05, "material.friction"),
     RecordEffect("height", "m", 3e-4),
 )
-"""Logarithms of factors on toughness, modulus and friction of the slice; by how much its food is
-higher (where heights are only known from the force: by how much its knife is lower)."""
+"""Logarithms of factors on toughness, modulus and friction of the slice; by how much it is taller
+(where heights are only known from the force: by how much its knife is lower)."""
 SPEED = RecordEffect("speed", "", 0.05)
 """Logarithm of a factor on the speed, of a record whose speed is not known."""
 
@@ -229,7 +229,11 @@ class SlicePredictor:
             p = p + rise[:, None] * [0.0, 0.0, 1.0]
         if target.stretches is None:
             return _Slice(None, R, p, Effects())
-        at_food = p if target.height_unknown else p - np.array([0.0, 0.0, height])
+        at_food = p
+        if height and not target.height_unknown:
+            # It lies on the board: what is half as high is higher by half of that.
+            higher = height * np.maximum(p[:, 2] / target.facts.height, 0.0)
+            at_food = p - higher[:, None] * [0.0, 0.0, 1.0]
         # A knife whose record is over rests.
         ends = np.minimum(target.stretches.ends, len(p) - 1)
         model, name = self.model(point, target), target.facts.name

@@ -194,7 +194,10 @@ class Run(abc.ABC):
             )
             for effect in self.effects:
                 effect.drive(now)
-            now.food_shift[2] += self.specimen.height
+            if self.facts.height > 0.0:
+                # A slice that is taller lies on the board as well.
+                over = max(float(path.p[b, 2]) / self.facts.height, 0.0)
+                now.food_shift[2] += over * self.specimen.height
             shifts.append(np.array([now.knife_shift, now.food_shift]))
             part, cut = self.advance(now, b)
             parts.append(part)
