@@ -251,6 +251,19 @@ def test_a_cause_is_named_beside_one_at_its_bound_where_it_gains_by_itself():
     assert reach_verdict(bounded(False), 60).names == [["skin"]]
 
 
+@pytest.mark.parametrize(("within", "named"), [(1.005, []), (1.03, [["rate"]])])
+def test_a_number_a_hair_inside_its_range_is_at_its_bound(within, named):
+    """A fit that strives beyond the end comes to rest there, on either side of it."""
+    problem = bounded(True)
+    columns = problem.found.columns
+    rate = [c.name for c in columns].index("rate")
+    columns[rate] = dc.replace(columns[rate], low=-9.0, high=9.0)
+    e = reach_verdict(problem, 60).screening.evidence("rate")
+    at = e.coefficients[0] * columns[rate].size
+    columns[rate] = dc.replace(columns[rate], high=within * at)
+    assert reach_verdict(problem, 60).names == named
+
+
 def test_a_cause_that_simulations_refute_is_not_named_nor_one_that_stands_for_it():
     for problem in (bounded(True), bounded(False)):
         rate = [c.name for c in problem.found.columns].index("rate")

@@ -48,6 +48,8 @@ OF_THE_BOARD = ("board_height", "board_stiffness")
 measured, and then seems to be of another stiffness as well."""
 RIVAL = 0.5
 """Least share of the largest gain from which on the other cause of the board is simulated too."""
+INSIDE = 0.99
+"""Share of a number's range from which it counts as at the end."""
 HALF = 0.5
 """Least share of the simulation's own error that a cause can do which is said to be near."""
 LIKE_LAW = (("in", "shared"), ("any", "shared"))
@@ -451,7 +453,7 @@ def _at_bound(e: CauseEvidence) -> str:
     found = [
         c.parameter
         for c, g in zip(e.columns, e.coefficients, strict=True)
-        if g != 0.0 and not c.low < g * c.size < c.high
+        if g != 0.0 and not INSIDE * c.low < g * c.size < INSIDE * c.high
     ]
     return f"{', '.join(found)} would be at a bound" if found else ""
 
