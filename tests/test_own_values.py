@@ -8,6 +8,7 @@ import numpy as np
 from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
+from sliceit_drake.diagnosis.known_error import mean_error
 from sliceit_drake.diagnosis.prediction import Point
 
 HEIGHT = 3e-4
@@ -132,3 +133,51 @@ def test_a_slice_that_breaks_down_at_its_own_values_is_seen_to_second_order():
     found = at_own_values(first, BreaksDown(first))
     assert np.isfinite(found.moments.gram).all()
     assert left(found) < 2.0
+
+
+def entry(depth: np.ndarray) -> np.ndarray:
+    """What a simulation gets wrong where the knife enters, N, by the depth in the slice."""
+    return -2.0 * np.exp(-(((depth - 1e-3) / 4e-4) ** 2))
+
+
+def of_a_wrong_entry() -> list[RecordSensitivity]:
+    rng, records = np.random.default_rng(5), []
+    for k, height in enumerate([-4e-4, 3e-4, -2e-4, 4e-4, -3e-4, 2e-4]):
+        r = record(k, height, rng)
+        there = entry(r.depth + height * (1.0 - r.depth / 0.02))[:, None]
+        records.append(dc.replace(r, height=0.02, measured=r.measured + there))
+    return records
+
+
+def test_what_is_learnt_of_slices_of_several_heights_is_not_smeared():
+    """Cuts that end over the board: only what the simulation gets wrong shows the heights."""
+    records = []
+    for r in of_a_wrong_entry():
+        rows = {n: v[r.depth < 0.019] for n, v in vars(r).items() if isinstance(v, np.ndarray)}
+        records.append(dc.replace(r, **rows))
+    known = mean_error(Sensitivities(COLUMNS, records))
+    (values,) = np.array(known.cuts[0].values)
+    depth = (np.arange(len(values)) - 1) * known.step
+    assert known.slices == 6
+    # The mean at equal places of the knife is wrong by 0.8 N.
+    assert np.abs(values - entry(depth))[depth > 0.0].max() < 0.35
+
+
+def test_what_is_known_goes_by_the_place_in_a_slice_that_is_taller():
+    records = []
+    for r in of_a_wrong_entry():
+        known = entry(r.depth)[:, None]
+        records.append(dc.replace(r, known=known, predicted=r.predicted + known))
+    first = LinearProblem(Sensitivities(COLUMNS, records, known_from=6))
+    again = at_own_values(first)
+
+    def left_at_entry(problem: LinearProblem) -> float:
+        rest = []
+        for r in problem.found.records:
+            X, y = r.columns[:, 0, problem.own], r.residual[:, 0]
+            left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+            rest.append(left[r.depth < 2e-3])
+        return float(np.std(rest)) / DEVIATION
+
+    assert left_at_entry(first) > 3.0
+    assert left_at_entry(again) < 1.3

@@ -16,8 +16,13 @@ from sliceit_drake.content_store import content_key
 from sliceit_drake.cutting.foods.known_error import KnownError, KnownErrorOfCut
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
-from sliceit_drake.diagnosis.evidence.own_values import at_own_values, centred_own
-from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
+from sliceit_drake.diagnosis.evidence.own_values import (
+    HEIGHT,
+    at_own_values,
+    centred_own,
+    farther_in,
+)
+from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
@@ -25,7 +30,14 @@ from sliceit_drake.prediction.discrepancy import Covariates, motion_phases
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["known_of", "learn_known_error", "record_key", "way_of", "with_known_error"]
+__all__ = [
+    "known_of",
+    "learn_known_error",
+    "mean_error",
+    "record_key",
+    "way_of",
+    "with_known_error",
+]
 
 ALIKE = (0.05, 0.03)
 """Differences in the decimal logarithm of the speed and in the share of the draw up to which cuts
@@ -85,18 +97,29 @@ def learn_known_error(
         progress=lambda done, total: show("simulations", done, total),
     )
     predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
-    problem = at_own_values(
-        LinearProblem(found, may_be_uneven=True),
-        predictor,
-        lambda done, total: show("own values", done, total),
-    )
-    own = centred_own(problem)
-    rests = [
-        r.residual - r.columns[:, :, problem.own] @ a
-        for r, a in zip(problem.found.records, own, strict=True)
-    ]
-    known = _mean(problem, rests)
+    known = mean_error(found, predictor, lambda done, total: show("own values", done, total))
     known.records, known.refinement = keys, setup.refinement
+    return known
+
+
+def mean_error(
+    found: Sensitivities,
+    predictor: SlicePredictor | None = None,
+    progress: Progress | None = None,
+) -> KnownError:
+    """What predictions get wrong in each kind of cut, at the same places in its slices.
+
+    Args:
+        found: The sensitivities.
+        predictor, progress: As of `at_own_values`.
+    """
+    known: KnownError | None = None
+    # The first mean is smeared: heights are found well where the sharp bends are known.
+    for at_own in (None, None, predictor):
+        about = known and with_known_error(found, known)
+        problem = at_own_values(LinearProblem(about or found, may_be_uneven=True), at_own, progress)
+        known = _with_rests(problem, known if about else None)
+    assert known is not None
     return known
 
 
@@ -106,22 +129,30 @@ def _cuts(problem: LinearProblem) -> list[list[int]]:
     return [members for members in problem.conditions.values() if records[members[0]].cut]
 
 
-def _mean(problem: LinearProblem, rests: Sequence[np.ndarray]) -> KnownError:
-    """Means over each kind of cut of what is left of records, each [m, c]."""
+def _with_rests(problem: LinearProblem, before: KnownError | None) -> KnownError:
+    """What was known of records before, and the means over each kind of cut of what is left, at the
+    same places in their slices, which differ in height by what is each one's own."""
     known = KnownError(channels=list(problem.found.records[0].channels), slices=0)
+    records, own = problem.found.records, centred_own(problem)
+    kinds = [problem.found.columns[k] for k in problem.own]
+    heights = own @ [c.size * (c.name == HEIGHT) for c in kinds]
     for members in _cuts(problem):
-        some = [problem.found.records[r] for r in members]
-        ways = [way_of(r) for r in some]
+        some = [records[r] for r in members]
+        ways = [way_of(records[r]) + farther_in(records[r], heights[r]) for r in members]
         count = int(max(w[-1] for w in ways) / known.step) + 2
         sums, rows = np.zeros((len(known.channels), count)), np.zeros(count)
         for r, way in zip(members, ways, strict=True):
+            rest = records[r].residual - records[r].columns[:, :, problem.own] @ own[r]
             place = np.rint(way / known.step).astype(int) + 1
             inside = (place >= 0) & (place < count)
             rows += np.bincount(place[inside], minlength=count)
-            for c, values in enumerate(rests[r][inside].T):
+            for c, values in enumerate(rest[inside].T):
                 sums[c] += np.bincount(place[inside], values, count)
         seen = np.flatnonzero(rows)
-        means = [np.interp(np.arange(count), seen, s[seen] / rows[seen]) for s in sums]
+        means = np.array([np.interp(np.arange(count), seen, s[seen] / rows[seen]) for s in sums])
+        if before is not None and (cut := _cut_like(before, some[0])) is not None:
+            earlier = np.array(cut.values)[:, :count]
+            means[:, : earlier.shape[1]] += earlier
         values = [[float(f"{x:.{DIGITS}g}") for x in row] for row in means]
         at = _covariates(some[0])
         known.cuts.append(KnownErrorOfCut(float(10.0**at.speed), at.draw, values))
@@ -136,19 +167,25 @@ def known_of(known: KnownError, record: RecordSensitivity) -> np.ndarray | None:
     out = np.zeros_like(record.measured)
     if not record.cut:
         return out
-    at = _covariates(record)
-    away = [
-        np.hypot((np.log10(c.speed) - at.speed) / ALIKE[0], (c.draw - at.draw) / ALIKE[1])
-        for c in known.cuts
-    ]
-    if not away or min(away) > 1.0:
+    cut = _cut_like(known, record)
+    if cut is None:
         return None
-    values, place = known.cuts[int(np.argmin(away))].values, way_of(record) / known.step + 1.0
+    values, place = cut.values, way_of(record) / known.step + 1.0
     for k, name in enumerate(record.channels):
         if name in known.channels:
             row = values[known.channels.index(name)]
             out[:, k] = np.interp(place, np.arange(len(row)), row, left=0.0, right=0.0)
     return out
+
+
+def _cut_like(known: KnownError, record: RecordSensitivity) -> KnownErrorOfCut | None:
+    """The cut of a record's kind, if of one something is known."""
+    at = _covariates(record)
+    away = [
+        np.hypot((np.log10(c.speed) - at.speed) / ALIKE[0], (c.draw - at.draw) / ALIKE[1])
+        for c in known.cuts
+    ]
+    return known.cuts[int(np.argmin(away))] if away and min(away) <= 1.0 else None
 
 
 def with_known_error(found: Sensitivities, known: KnownError) -> Sensitivities | None:

@@ -37,7 +37,7 @@ class KnownError:
     """
 
     channels: list[str] = dc.field(default_factory=list)
-    step: float = quantity(5e-4, "m", low=1e-5, high=0.01)
+    step: float = quantity(2.5e-4, "m", low=1e-5, high=0.01)
     """Of the way between the values, which begin this far before the first contact; see
     `diagnosis.known_error.way_of`."""
     refinement: float = quantity(1.0, "", low=0.01, high=100.0)
