@@ -418,6 +418,25 @@ def test_a_cause_that_differs_from_record_to_record_foretells_none():
     assert not foretold(lambda k: (-1.0) ** k)[0]
 
 
+@pytest.mark.parametrize("in_air", [1.0, 0.0])
+def test_a_cause_that_shows_where_food_is_cut_and_not_in_the_air_foretells_none(in_air):
+    """As what a sensor with a play shows, which a drift explains, but for records of the air."""
+    found = problem(42, replicates=4).found
+    rate = [c.name for c in found.columns].index("rate")
+    rng = np.random.default_rng(0)
+    for k, r in enumerate(found.records):
+        columns, wave = r.columns.copy(), 2.0 * NOISE * np.sin(8.0 * r.time)
+        changed = dict(measured=r.measured + wave[:, None])
+        if k % 4 == 0:
+            columns *= 0.0
+            rest = NOISE * rng.normal(size=len(wave)) + in_air * wave
+            changed = dict(measured=r.predicted + rest[:, None], in_contact=r.in_contact & False)
+        columns[:, 0, rate] = wave
+        found.records[k] = dc.replace(r, columns=columns, even=0.0 * columns, **changed)
+    whole, cause = LinearProblem(found), ("rate", None)
+    assert foretells(whole, cause, [], OwnError.beside(whole, [cause])) == bool(in_air)
+
+
 @pytest.mark.parametrize(("slow", "white"), [(0.99, 0.1), (0.1, 0.99)], ids=["slow", "white"])
 def test_a_wave_is_as_large_as_over_the_noise_at_its_frequency(slow, white):
     """The power of noise with an exponential autocovariance at 20 Hz, in closed form."""
