@@ -11,7 +11,14 @@ from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, 
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError
 from sliceit_drake.diagnosis.evidence.linear import PLAUSIBLE, LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.prediction.discrepancy import PHASES, Covariates, Sizes, motion_shapes
+from sliceit_drake.prediction.discrepancy import (
+    FINER,
+    PHASES,
+    SHAPES,
+    Covariates,
+    Sizes,
+    motion_shapes,
+)
 
 ROWS, CHANNELS = 70, ("force_z", "torque_y")
 NOISE = [ChannelNoise(0.05, 0.1, 0.1), ChannelNoise(0.002, 0.1, 0.003)]
@@ -281,6 +288,18 @@ def test_units_and_the_order_of_records_change_nothing(known: LinearProblem) -> 
     np.testing.assert_allclose(turned.sizes.flat, start.flat, atol=0.03)
     np.testing.assert_allclose(milli.sizes.channel, start.channel + np.log(1e3), atol=0.03)
     np.testing.assert_allclose(milli.sizes.flat[2:], start.flat[2:], atol=0.03)
+
+
+@pytest.mark.parametrize("period", [8e-3, 12e-3])
+def test_shapes_of_uneven_slices_follow_their_waves_down_to_the_board(period: float) -> None:
+    depth = np.linspace(1e-4, 0.03, 600)
+    wave, left = np.sin(2.0 * np.pi * depth / period), []
+    for count in (SHAPES["in"], FINER):
+        values, phase = motion_shapes(depth / 0.02, depth, depth, depth > 0.0, 0.03, 0.03, count)
+        inside = values[:, phase == PHASES.index("in")]
+        rest = wave - inside @ np.linalg.lstsq(inside, wave, rcond=None)[0]
+        left.append(np.std(rest[depth > 0.015]))
+    assert left[1] < 0.6 * left[0]
 
 
 def test_phases_and_covariates_are_those_of_the_motion() -> None:

@@ -28,10 +28,12 @@ from scipy.linalg.lapack import dpotri, dtrtrs
 from scipy.optimize import Bounds, minimize
 
 __all__ = [
+    "FINER",
     "LESS",
     "PARTS",
     "PHASES",
     "PRIOR",
+    "SHAPES",
     "USUAL_SHARE",
     "Covariates",
     "Discrepancy",
@@ -50,6 +52,9 @@ FIRST, SECOND = np.triu_indices(3)
 """Pairs of the parts that conditions share."""
 SHAPES = {"in": 10, "out": 5, "again": 5}
 """Number of shapes of a phase."""
+FINER = 16
+"""Of those on the way in, where slices may be uneven: a food is as uneven below as at its top,
+where the shapes are finest."""
 ENTRY = 3e-3
 """Depth over which shapes are finest, metres."""
 BOARD = 2e-4
@@ -122,6 +127,7 @@ def motion_shapes(
     touching: np.ndarray,
     reach: float,
     height: float = np.inf,
+    count: int = SHAPES["in"],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Shapes of a record.
 
@@ -135,6 +141,7 @@ def motion_shapes(
         touching: Whether the knife touches [m].
         reach: Greatest depth of all records, metres.
         height: Of the food, metres: the board is at this depth.
+        count: Number of shapes on the way in.
 
     Returns:
         Values [m, n], and the number of the phase of each shape [n].
@@ -163,7 +170,7 @@ def motion_shapes(
         else:
             shapes = [
                 np.sin((j + 0.5) * np.pi * at) / (1.0 + (j / SMOOTH) ** 2)
-                for j in range(SHAPES[name])
+                for j in range(count if name == "in" else SHAPES[name])
             ]
             where = going == number
             if name == "in":

@@ -32,8 +32,10 @@ from sliceit_drake.diagnosis.evidence.noise_levels import (
 )
 from sliceit_drake.diagnosis.evidence.searches import unlike_others
 from sliceit_drake.prediction.discrepancy import (
+    FINER,
     LESS,
     PRIOR,
+    SHAPES,
     USUAL_SHARE,
     Covariates,
     Discrepancy,
@@ -233,8 +235,10 @@ class LinearProblem:
         reach = max(float(r.depth.max()) for r in found.records)
         self.shape_values = []
         squares = np.zeros(channels + 1)
+        on_the_way_in = FINER if self.may_be_uneven else SHAPES["in"]
         for r in found.records:
-            values, phase = motion_shapes(r.time, r.depth, r.path, r.in_contact, reach, r.height)
+            along = r.time, r.depth, r.path, r.in_contact
+            values, phase = motion_shapes(*along, reach, r.height, on_the_way_in)
             self.shape_values.append(values)
             inside = r.predicted[r.in_contact]
             squares += np.append((inside**2).sum(0), len(inside))
