@@ -159,7 +159,7 @@ def test_what_is_learnt_of_slices_of_several_heights_is_not_smeared():
     (values,) = np.array(known.cuts[0].values)
     depth = (np.arange(len(values)) - 1) * known.step
     assert known.slices == 6
-    # The mean at equal places of the knife is wrong by 0.8 N.
+    # The mean at equal places of the knife is wrong by 0.55 N.
     assert np.abs(values - entry(depth))[depth > 0.0].max() < 0.35
 
 

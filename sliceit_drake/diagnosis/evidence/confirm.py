@@ -142,7 +142,7 @@ def _corrected(
     ]
     # Made anew: where a force jumps is where the simulation now has it.
     found = dc.replace(moved.found, records=records)
-    out = LinearProblem(found, *moved.slice_levels, may_be_uneven=moved.may_be_uneven)
+    out = LinearProblem(found, *moved.slice_levels)
     out.near = moved.near
     return out
 

@@ -341,9 +341,9 @@ class LinearProblem:
     @property
     def slice_levels(
         self,
-    ) -> tuple[tuple[ChannelNoise, ...], np.ndarray, np.ndarray, tuple[ChannelNoise, ...]]:
+    ) -> tuple[tuple[ChannelNoise, ...], np.ndarray, np.ndarray, tuple[ChannelNoise, ...], bool]:
         """What was estimated of noise and slices, as `LinearProblem` takes it."""
-        return self.noise, self.variation, self.uneven, self.differences
+        return self.noise, self.variation, self.uneven, self.differences, self.may_be_uneven
 
     @functools.cached_property
     def scales(self) -> list[np.ndarray]:

@@ -85,8 +85,8 @@ def centred_own(problem: LinearProblem) -> np.ndarray:
 
 
 def farther_in(record: RecordSensitivity, taller: float) -> np.ndarray:
-    """How much farther the knife is on its first way through a slice that is taller, metres [m],
-    metres: as much as it is taller at its top, where it goes straight down, and nothing at the
+    """How much farther the knife is on its first way through a slice that is taller [m], metres: as
+    much as it is `taller`, metres, at its top, where it goes straight down, and nothing at the
     board, on which it lies."""
     going, _ = motion_phases(record.time, record.depth, record.path)
     above = np.arange(len(going)) < int(np.argmax(record.depth > 0.0))

@@ -232,7 +232,7 @@ def _joined(problem: LinearProblem, new: Sensitivities, names: set[str]) -> Line
     ]
     records += [dc.replace(r, columns=picked(r.columns), even=picked(r.even)) for r in new.records]
     found = Sensitivities(columns, records, [], max(old.elements, new.elements))
-    return LinearProblem(found, *problem.slice_levels, may_be_uneven=problem.may_be_uneven)
+    return LinearProblem(found, *problem.slice_levels)
 
 
 def next_experiment(
