@@ -184,7 +184,8 @@ TESTED = {
         "sliceit hardware scenarios/cucumber_measured.yaml --host 127.0.0.1 --pace 0.25"
         " --robot hardware/emulated.yaml",
         "sliceit emulate scenarios/cucumber_measured.yaml --pace 0.2",
-        "sliceit hardware --host 127.0.0.1 --pace 0.2 --robot hardware/emulated.yaml",
+        "sliceit hardware scenarios/cucumber_measured.yaml --host 127.0.0.1 --pace 0.2"
+        " --robot hardware/emulated.yaml",
     ],
     "tests/test_hardware_end_to_end.py::test_the_touch_finds_a_lifted_board_and_refuses_the_"
     "height_that_was_given": ["sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --touch"],

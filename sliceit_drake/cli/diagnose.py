@@ -7,7 +7,7 @@ condition at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
   extended.yaml   the food and its bench with the cause in them: `calibration: DIR/extended.yaml`
                   in a scenario
 
-The verdict is one of: nothing beyond noise; a cause (or two) with size; a class of causes that
+The verdict is one of: nothing beyond noise; one to three causes with size; a class of causes that
 these records cannot tell apart, and the experiment that would; unknown; too few replicates. For a
 single record it is `one_slice`: what that slice shows, and no diagnosis; no food is extended by it.
 

@@ -14,7 +14,7 @@ In the replay and in the live view (--meshcat) you see:
   orange arrow   force of the board on the knife
   purple arrow   force that the wrist sensor measures, at the flange
   two heads      moments, 20 Nm a metre, in lighter colours
-  cut faces      plum where the food is intact, orange half cut, pale green where it is cut
+  cut faces      plum where the food is intact, orange half cut, the food's own colour where cut
 "Open Controls" > Scene is a tree of what is shown. Untick drake > food > minus (or plus) to look at
 the cut face of the other half, wrench for no arrows; tick frames (or give --frames) for the
 coordinate frames W world, B robot base, S sensor, K knife, F food.

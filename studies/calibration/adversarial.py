@@ -294,14 +294,14 @@ def run(options: argparse.Namespace) -> int:
 HEAD = """\
 # Curves with something wrong
 
-What a new user brings, and what the import and the calibration say of it. The good curve is the
-paper's potato; how each is made stands in `studies/calibration/adversarial.py`. "Used" are curves
-whose commands end well, with a warning or without. What should be said was written down with the
-answers of an earlier run in sight: "right" means that the fault is named. Three are not told from
-curves without it: a potato of 3 N is possible, so that kgf cannot be seen; a force that only grows
-is said to leave modulus and toughness open, as many good curves do; an offset cannot be taken off a
-curve that begins in the food. The warning of the first row is about the coarse mesh, not about the
-curve.
+This page shows typical mistakes in a new user's curve, and what import and calibration say about
+them. The good curve is the paper's potato; `studies/calibration/adversarial.py` makes the others.
+"Used" means that the commands end well, with or without a warning. "Right" means that the message
+names the fault; the expected messages were written down after an earlier run had been seen. Three
+faults cannot be told from good curves. A potato of 3 N is possible, so kgf cannot be recognised. A
+force that only grows is said to leave modulus and toughness open, as many good curves do. And an
+offset cannot be taken off a curve that begins in the food. The warning in the first row is about
+the coarse mesh, not about the curve.
 
     python -m studies adversarial --output docs/results/adversarial_curves.md
 

@@ -219,7 +219,7 @@ def claim(found: Sequence[Comparison]) -> list[str]:
         lines.append(
             f"- {world.replace('_', '-')}, board of {board:g} N/m: less contact force "
             f"{_listed(holds, 'on ', 'on no food')}{_listed(fails, '; not shown on ', '')}; {done} "
-            "of the slices."
+            "of the slices, averaged over the foods."
         )
     return lines
 

@@ -407,8 +407,8 @@ def _refusal(
         if scatter.freedom == 0.0:
             return "no slices are cut alike, which would show how they scatter"
         if scatter.chance(e.gain, numbers) > rule.scatter:
-            times = f"{scatter.factor:.1f} times as much as their model says"
-            return f"gains {e.gain:.0f}, where slices that are cut alike scatter {times}"
+            times = f"{scatter.factor:.1f} times as much as the model of their differences allows"
+            return f"gains {e.gain:.0f}, but replicate slices scatter {times}"
     # A law cannot be wrong in the air.
     inside = 1.0 if e.per_record else _share_in_contact(problem, e)
     wrong = OwnError.beside(problem, [*before, e.cause])
