@@ -216,7 +216,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
     page = "speed.md"
     found = docs.numbers(page, r"today's [\d.]+ to [\d.]+ us: ([\d.]+) times as fast")
     yield measured(
-        "the same against the code of version 0.1, in turns",
+        "the same against the code of version 0.1 (20b84b1), in turns",
         ">= 2.4 times as fast",
         "python -m studies station_speed",
         page,
