@@ -1,8 +1,9 @@
 """Values that replace single fields of a configuration: as YAML, or by their paths."""
 
 import dataclasses as dc
+import functools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -74,17 +75,29 @@ class Replacements:
             self.texts += [f"{path}: {paths[path]}" for path in top]
             self._written |= {path: value for path, value in paths.items() if path not in top}
 
-    def load(self, file: Path | None, given: Any = None) -> Any:
+    def load(
+        self,
+        file: Path | None,
+        given: Any = None,
+        put_in: Callable[[Any, Callable[[Any], Any]], Any] = lambda config, _: config,
+    ) -> Any:
         """Reads a file and merges `texts` over it, see `load_yaml`.
+
+        Args:
+            file: None to start from what is given.
+            given: Holds the values of fields that the file leaves out; None for the defaults.
+            put_in: Puts into a configuration what the file or a text names in it. It also takes
+                what merges the same file or text over a configuration once more.
 
         Raises:
             ConfigurationError: Naming file, field and fix.
         """
+        layers = [(file, None), *((None, text) for text in self.texts)]
+        loaded = given
         try:
-            first = self.texts[0] if self.texts else None
-            loaded = load_yaml(self._schema, file, given, first, self.source)
-            for text in self.texts[1:]:
-                loaded = load_yaml(self._schema, None, loaded, text, self.source)
+            for layer in layers:
+                merge = functools.partial(self._merge, *layer)
+                loaded = put_in(merge(loaded), merge)
         except ConfigurationError as error:
             top, _, name = (error.field or "").partition(".")
             like = path_that_is_meant(self._schema() if given is None else given, name)
@@ -101,6 +114,10 @@ class Replacements:
             ) from None
         return loaded
 
+    def _merge(self, file: Path | None, text: str | None, config: Any) -> Any:
+        """A file and a text over a configuration."""
+        return load_yaml(self._schema, file, config, text, self.source)
+
     def set_in(self, config: Any, where: str) -> None:
         """Sets what was given by paths, and validates.
 
@@ -112,7 +129,7 @@ class Replacements:
             ConfigurationError: There is no such field, or it cannot hold the value.
         """
         for path, value in self._values.items():
-            _set_field(config, path, plain(value), where)
+            _set_field(config, path, plain(value), where, self.source)
         for path, text in self._written.items():
             _set_field_to_yaml(config, path.removeprefix(f"{where}."), text, where, self._option)
         validate(config, where)
@@ -162,18 +179,26 @@ def _assignments(text: str) -> dict[str, str] | None:
     return {path.strip(): value.strip() for path, value in pairs}
 
 
-def _set_field(config: Any, path: str, value: Any, where: str) -> None:
+def _set_field(config: Any, path: str, value: Any, where: str, source: str) -> None:
     """Sets the field at a path of names, and of numbers of elements of lists.
 
     Args:
         config: Dataclass, changed in place and not validated.
         path: As `food.material.toughness` or `motion.segments.0.speed`.
-        value: What the field shall hold.
+        value: What the field shall hold. What YAML has no form for is not checked.
         where: Dotted path of `config`, for errors.
+        source: Where the value comes from, for errors.
 
     Raises:
-        ConfigurationError: There is no such field.
+        ConfigurationError: There is no such field, or it cannot hold the value.
     """
+    try:
+        text = yaml.safe_dump(value, default_flow_style=True).removesuffix("...\n").strip()
+    except yaml.YAMLError:
+        text = None
+    if text is not None:
+        _set_field_to_yaml(config, path, text, where, source)
+        return
     at, last = _owner(config, path, where)
     if isinstance(at, list | np.ndarray):
         at[int(last)] = value
@@ -194,11 +219,16 @@ def _set_field_to_yaml(config: Any, path: str, text: str, where: str, source: st
     """
     at, last = _owner(config, path, where)
     parent = path.rpartition(".")[0]
-    if isinstance(at, list | np.ndarray):
-        at[int(last)] = yaml.safe_load(text)
-    else:
+    if not isinstance(at, list | np.ndarray):
         merged = merge_yaml(at, f"{last}: {text}", source, f"{where}.{parent}".rstrip("."))
         setattr(at, last, getattr(merged, last))
+        return
+    # The type of an element is known to what holds its list.
+    holder, name = _owner(config, parent, where)
+    merged = merge_yaml(
+        holder, f"{name}: [{text}]", source, f"{where}.{parent.rpartition('.')[0]}".rstrip(".")
+    )
+    at[int(last)] = getattr(merged, name)[0]
 
 
 def path_that_is_meant(config: Any, path: str) -> str | None:

@@ -17,7 +17,7 @@ from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, SurfaceFactors
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 
@@ -218,6 +218,8 @@ def test_a_context_cloned_in_the_middle_of_a_cut_goes_on_identically(diagram, al
     original = Slice(diagram, *MOTIONS[1]).advance(half)
     copy = Slice.__new__(Slice)
     copy.diagram, copy.cutting = diagram, original.cutting
+    with pytest.raises(CuttingError, match="in the middle of a cut"):
+        Simulator(diagram, original.simulator.get_context().Clone()).Initialize()
     copy.simulator = Simulator(diagram, original.simulator.get_context().Clone())
     copy.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
     copy.wrenches = list(original.wrenches)

@@ -1,9 +1,11 @@
 """`import sliceit_drake as sliceit`: its names, and what a user makes with them."""
 
 import csv
+import dataclasses as dc
 import importlib.util
 import inspect
 import json
+import math
 import re
 import subprocess
 import sys
@@ -220,6 +222,69 @@ def test_a_named_food_can_be_changed_after_it_is_loaded_and_replaced_by_another(
     assert knives.knife == sliceit.cutting.load_knife("chef").knife
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        "food.material.toughness=400",
+        "{food: {material: {toughness: 400}}}",
+        "food={material: {toughness: 400}}",
+        {"food.material.toughness": 400},
+        {"food": {"material": {"toughness": 400}}},
+        {"food.material": {"toughness": 400}},
+    ],
+)
+def test_a_change_of_a_named_food_is_simulated_in_all_its_forms_and_from_its_file(
+    changes, tmp_path
+):
+    changed = sliceit.load_scenario("apple", changes)
+    apple = sliceit.load_calibrated_food("apple").food.material
+    assert changed.food.material == dc.replace(apple, toughness=400.0)
+    sliceit.dump_yaml(changed, tmp_path / "scenario.yaml")
+    assert sliceit.load_scenario(tmp_path / "scenario.yaml") == changed
+
+
+def test_a_name_that_is_set_in_python_is_put_in_once():
+    scenario = sliceit.load_scenario("cucumber_measured")
+    scenario.calibration, scenario.knife_name = "potato", "nakiri"
+    loaded = sliceit.load_scenario(scenario)
+    assert loaded.food.material == sliceit.load_calibrated_food("potato").food.material
+    assert loaded.knife == sliceit.cutting.load_knife("nakiri").knife
+    loaded.food.material.toughness = 5.0
+    assert sliceit.load_scenario(dc.replace(loaded, seed=1)).food.material.toughness == 5.0
+    scenario.calibration = "no food"
+    with pytest.raises(sliceit.ConfigurationError, match="calibration: 'no food'"):
+        sliceit.load_scenario(scenario)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ("controller.p_gains.0=[1]", r"p_gains\[0\]: is a list. Give a number"),
+        ("controller.p_gains.0=[1,", "not valid YAML"),
+        ("motion.segments.0=3", r"segments\[0\]: expected named fields"),
+        ({"controller.dead_zones": "maybe"}, "controller.dead_zones"),
+        ({"food.material": {"toughnes": 300}}, 'Did you mean "toughness"'),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_refused_whatever_gives_it(changes, message):
+    with pytest.raises(sliceit.ConfigurationError, match=message):
+        sliceit.load_scenario("cucumber_measured", changes)
+
+
+def test_an_element_of_a_list_is_replaced_as_its_type_is_written():
+    found = sliceit.load_scenario(
+        "cucumber_measured", "motion.segments.0=!Hold {duration: 1.0}, controller.p_gains.0=2e2"
+    )
+    assert type(found.motion.segments[0]).__name__ == "Hold"
+    assert found.controller.p_gains[0] == 200.0
+
+
+@pytest.mark.parametrize("duration", [math.nan, 0.0, -1.0, math.inf])
+def test_a_duration_that_is_none_is_refused(duration):
+    with pytest.raises(sliceit.ConfigurationError, match="duration: is .*above 0 s"):
+        sliceit.simulate("cucumber_spring", duration=duration, replay=False)
+
+
 # --- What is put in.
 
 
@@ -247,6 +312,11 @@ def test_what_decides_is_a_policy_too():
     assert run.own == {"policy": "Gentle"} and run.stopped is None
     assert 0.2 < run.record()["cut_progress"][-1] < 0.6
     assert run.meshcat is None and run.plot() is not None
+
+
+def test_what_cannot_decide_is_no_policy():
+    with pytest.raises(sliceit.ConfigurationError, match="policy: str has no method decide"):
+        sliceit.simulate("cucumber_spring", policy="PressByForce", replay=False)
 
 
 def test_a_policy_of_ones_own_under_limits_of_ones_own_is_saved(tmp_path):
@@ -333,3 +403,5 @@ def test_a_sweep_that_makes_no_sense_is_refused():
             sliceit.sweep(name, {"seed": [0]}, robot=False)
     with pytest.raises(sliceit.ConfigurationError, match="no finite elements"):
         sliceit.sweep("cucumber_spring", {"seed": [0]}, robot=False)
+    with pytest.raises(sliceit.ConfigurationError, match="bench: is of a station"):
+        sliceit.sweep("cucumber_measured", {"bench.board.height": [0.0, 1e-3]}, robot=False)

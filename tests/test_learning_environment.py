@@ -312,8 +312,12 @@ def test_foods_are_drawn_or_asked_for():
     drawn = {env.reset(seed=seed)[1]["food"] for seed in range(8)}
     assert drawn == {"cucumber", "tomato"}
     assert env.reset(seed=0, options={"food": "tomato"})[1] == {"food": "tomato"}
+    moment = env.moment()
     with pytest.raises(ValueError, match="no food 'carrot'; it has cucumber, tomato"):
         env.reset(options={"food": "carrot"})
+    with pytest.raises(ValueError, match="there is no option \\['fod'\\]"):
+        env.reset(options={"fod": "tomato"})
+    assert env.moment() == moment  # A reset that is refused changes nothing.
 
 
 THEIRS = RewardConfig(force_shape="sigmoid", force_scale=2.0)

@@ -168,7 +168,6 @@ def test_the_command_leaves_a_scenario_that_simulate_takes(tmp_path, capsys):
     out = tmp_path / "out"
     arguments = [
         "optimize-motion",
-        "cucumber_measured",
         "--set",
         small,
         "--output",
@@ -182,6 +181,7 @@ def test_the_command_leaves_a_scenario_that_simulate_takes(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "N in the mean over the depth" in said
     scenario = load_scenario(out / "scenario.yaml")
+    assert scenario.measurement is None  # It is of another motion.
     slicing = scenario.motion.segments[0]
     summary = json.loads((out / "summary.json").read_text())
     assert len(summary["by_start"]) == 2 and min(summary["by_start"]) == summary["force"]

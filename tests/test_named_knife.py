@@ -67,6 +67,16 @@ def test_a_scenario_takes_the_knife_that_it_names_and_says_so_again_when_written
     assert load_scenario(tmp_path / "nakiri.yaml").knife == nakiri.knife
 
 
+@pytest.mark.parametrize("changes", ["{knife: {length: 0.3}}", "knife.length=0.3"])
+def test_what_stands_beside_a_name_wins_and_is_there_again_when_written(changes, tmp_path):
+    for overrides in ([changes], ["knife_name: nakiri", changes]):
+        changed = load_scenario("apple", overrides)
+        named = load_knife("cleaver" if len(overrides) == 1 else "nakiri").knife
+        assert changed.knife == dc.replace(named, length=0.3)
+        dump_yaml(changed, tmp_path / "changed.yaml")
+        assert load_scenario(tmp_path / "changed.yaml") == changed
+
+
 def test_a_knife_of_ones_own_is_named_by_its_file(tmp_path):
     mine = NamedKnife(Knife(length=0.123), {"length": "my ruler"})
     dump_yaml(mine, tmp_path / "mine.yaml")
@@ -78,7 +88,6 @@ def test_a_knife_of_ones_own_is_named_by_its_file(tmp_path):
     ("overrides", "words"),
     [
         ("knife_name: katana", r"scenario\.knife_name: there is no knife 'katana'; there are chef"),
-        ("{knife_name: chef, knife: {length: 0.3}}", r"scenario\.knife: cannot stand beside.*chef"),
         ("knife: {profile: serrated}", r"knife\.profile: serrated is not supported: teeth"),
         ("knife: {profile: wavy}", r"knife\.profile: 'wavy' is not one of straight, serrated"),
     ],

@@ -149,6 +149,19 @@ def test_what_does_not_fit_the_scenario_is_refused():
         MakeStation(scenario(), hardware=robot, cutting=Dough)
 
 
+@pytest.mark.parametrize(
+    "found", [(np.zeros(3), 0.0), np.zeros(6), (np.full(6, np.nan), 0.0), (np.zeros(6), 7.0)]
+)
+def test_a_force_that_is_none_stops_the_run_and_names_the_class(found):
+    class Wrong(Dough):
+        def advance(self, context, state, X_WK):
+            return found
+
+    run = prepare_run(Scenario(), cutting=Wrong)
+    with pytest.raises(RuntimeError, match=r"at t = 0\.002 s Wrong\.advance returned"):
+        run.advance(0.02)
+
+
 def test_a_slice_record_does_not_say_that_the_replaced_food_was_cut():
     run = prepare_run(Scenario(), cutting=Dough)
     run.advance(0.02)

@@ -1,6 +1,7 @@
 """Series for ParaView have the food's body, the knife and the forces that the record has."""
 
 import dataclasses as dc
+import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -162,6 +163,11 @@ def test_a_run_that_is_not_the_records_is_said_to_be_another(run, tmp_path, caps
 
 
 def test_what_cannot_be_exported_is_refused(run, tmp_path, capsys):
+    own = tmp_path / "own"
+    shutil.copytree(run, own)
+    (own / "summary.json").write_text('{"own": {"policy": "Gentle"}}', encoding="utf-8")
+    assert main(["export", str(own)]) == 2
+    assert "the user's own policy, which its folder does not have" in capsys.readouterr().err
     assert main(["export", str(tmp_path)]) == 2
     assert "there is no scenario.yaml" in capsys.readouterr().err
     prepared = prepare_run(load_scenario(resource_path("scenarios/cucumber_spring.yaml")))

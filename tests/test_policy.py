@@ -91,15 +91,23 @@ def test_stiffness_and_gains_are_the_configured_ones_where_it_leaves_them_alone(
         assert np.array_equal(system.GetOutputPort("p_gains").Eval(context), GAINS)
 
 
-def test_a_decision_that_is_no_number_stops_the_run_and_names_the_system():
+@pytest.mark.parametrize(
+    ("decision", "message"),
+    [
+        (PolicyAction(0.0, np.nan), "policy: at t = 0 s the policy decided for speeds"),
+        (None, "policy: at t = 0 s Scripted.decide returned None"),
+        (PolicyAction(0.0, 0.0, stiffness=np.ones(2)), "the policy's stiffness are"),
+    ],
+)
+def test_a_decision_that_is_none_stops_the_run_and_names_the_system(decision, message):
     builder = DiagramBuilder()
-    config = PolicyConfig(decide=Scripted(PolicyAction(0.0, np.nan)))
+    config = PolicyConfig(decide=Scripted(decision))
     policy = builder.AddNamedSystem("policy", PolicySystem(config, START, STIFFNESS, GAINS))
     builder.ExportInput(policy.GetInputPort("sensor_wrench"))
     diagram = builder.Build()
     simulator = Simulator(diagram)
     diagram.get_input_port(0).FixValue(simulator.get_mutable_context(), SpatialForce.Zero())
-    with pytest.raises(RuntimeError, match="policy: at t = 0 s"):
+    with pytest.raises(RuntimeError, match=message):
         simulator.AdvanceTo(0.1)
 
 

@@ -47,16 +47,16 @@ DIAGNOSIS_REFINEMENT = 0.75
 WORKERS = (1, 10_000)
 
 
-def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
+def add_scenario_arguments(parser: argparse.ArgumentParser, default: str = SCENARIO) -> None:
     """Adds SCENARIO and --set."""
     shipped = ", ".join(shipped_names("scenarios"))
     parser.add_argument(
         "scenario",
         nargs="?",
-        default=SCENARIO,
+        default=default,
         metavar="SCENARIO",
         help=f"YAML file, or the name of one that ships with the package: {shipped}; default "
-        f"{SCENARIO}",
+        f"{default}",
     )
     add_overrides(parser, "--set", "food.material.toughness=400")
 

@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> int:
         frames, difference = run_again(folder, options.fps, show)
     if difference is not None:
         print(
-            f"This run differs from the record by up to {difference:.3g} N: it was made by"
-            " another version or on another machine. The series is of this run."
+            f"This run differs from the record by up to {difference:.3g} N, as one of another"
+            " version or machine can. The series is of this run."
         )
     output = options.output or folder / "paraview"
     files = write_series(frames, output, options.format)

@@ -14,6 +14,7 @@ import argparse
 import math
 
 from sliceit_drake.cli.arguments import (
+    ONE_CUT,
     add_output_folder,
     add_scenario_arguments,
     check_numbers,
@@ -26,8 +27,8 @@ __all__ = ["add_arguments", "run"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
-    add_scenario_arguments(parser)
-    add_output_folder(parser, "where motion and figure go", required=True)
+    add_scenario_arguments(parser, ONE_CUT)
+    add_output_folder(parser, "where both files go", required=True)
     for name, unit, default, text in (
         ("duration", "S", 3.0, "longest time of the cut, s"),
         ("draw-speed", "V", 0.15, "greatest speed along the edge, m/s"),

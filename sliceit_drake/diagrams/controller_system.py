@@ -77,7 +77,7 @@ class ControllerSystem(LeafSystem):
         Returns:
             Joint positions [6], rad.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no method advance")
 
     def knife_pose(self, context: Context, q: np.ndarray) -> RigidTransform:
         """X_WK at joint positions [6], rad."""
@@ -102,4 +102,11 @@ class ControllerSystem(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         q = context.get_discrete_state(self._command).value()
-        discrete_state.set_value(self._command, self.advance(context, q))
+        command = np.asarray(self.advance(context, q), float)
+        if command.shape != (6,) or not np.isfinite(command).all():
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s "
+                f"{type(self).__name__}.advance returned {command}. It has to return the positions "
+                "of six joints."
+            )
+        discrete_state.set_value(self._command, command)

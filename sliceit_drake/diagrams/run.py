@@ -3,6 +3,7 @@
 import dataclasses as dc
 import gc
 import json
+import math
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -111,8 +112,13 @@ class Run:
         Args:
             duration: Simulated time at the end, s; None for the motion's.
             progress: Called with simulated time and wall time, s, after each part.
+
+        Raises:
+            ConfigurationError: The duration is no time.
         """
         end = self.motion.duration if duration is None else duration
+        if not 0.0 < end < math.inf:
+            raise ConfigurationError(f"is {end}", field="duration", fix="Give a time above 0 s.")
         # The run makes no cycles worth collecting, but walking through all imported modules costs.
         gc.collect()
         gc.freeze()

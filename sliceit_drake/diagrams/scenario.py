@@ -1,8 +1,11 @@
 """A scenario: everything about one simulated or real slice, and the YAML that holds it."""
 
+import copy
 import dataclasses as dc
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -34,6 +37,11 @@ CLEAR_OF_FOOD = 1e-3
 """Least height of the knife over the food while it goes from one slice to the next, metres."""
 NAMED = {"food": "calibration", "knife": "knife_name"}
 """Fields of a scenario that name what ships, by the fields that they replace."""
+
+
+class _PutIn(str):
+    """The name of a food or knife whose values a scenario has: they are not put in again, which
+    would undo what was changed since."""
 
 
 @dc.dataclass
@@ -96,7 +104,7 @@ class Scenario:
     seed: int = quantity(0, "", low=0, high=2**31 - 1)
     """Seed of everything random."""
     exchange_period: float = quantity(0.002, "s", low=2.5e-4, high=0.02)
-    """Interval at which food, controller and sensor update."""
+    """Interval at which food and sensor update; the controller has its own, `controller.period`."""
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     controller: ComplianceControllerConfig = dc.field(default_factory=_tracking)
@@ -104,14 +112,14 @@ class Scenario:
     monitor: ContactMonitorConfig = dc.field(default_factory=ContactMonitorConfig)
     knife: Knife = dc.field(default_factory=Knife)
     knife_name: str | None = None
-    """A knife by name (calibration/knives) or file; it takes the place of `knife`."""
+    """A knife by name (calibration/knives) or file; fields of `knife` beside it replace its."""
     board: Board = dc.field(default_factory=Board)
     bench: BenchErrors = dc.field(default_factory=BenchErrors)
     """What the bench does otherwise than the rest says; a food of a diagnosis has it."""
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     calibration: str | None = None
-    """A calibrated food, by name (calibration/foods) or file: its material, effects and flank
-    stiffness take the place of those in `food` and `numerics`."""
+    """A calibrated food, by name (calibration/foods) or file: its material and effects, and its
+    `bench`. Fields of `food` and `bench` beside it replace its."""
     numerics: Numerics = dc.field(default_factory=Numerics)
     holder: str = choice("clamp", ("clamp", "arm"))
     """What is drawn where the food is held; arm: a second UR5e that stands still."""
@@ -221,14 +229,22 @@ def load_scenario(
     """
     replacements = Replacements(overrides, Scenario)
     if isinstance(scenario, Scenario):
-        file, given, source = None, scenario, "scenario"
+        file, given = None, _put_in_named(scenario, copy.deepcopy)
     else:
         file, given = scenario_file(scenario), Scenario()
-        source = str(file)
     loaded = _load(file, given, replacements)
-    if file is not None and isinstance(loaded.food, Food):
-        loaded.food.look_beside(file)
-    _put_in_named(loaded, given, source)
+    if isinstance(loaded.food, Food):
+        if file is not None:
+            loaded.food.look_beside(file)
+        if loaded.preparation is not None and loaded.preparation.peeled:
+            loaded.food.effects.skin.toughness = 0.0
+    elif loaded.calibration is not None:
+        raise ConfigurationError(
+            "is of a food of finite elements",
+            field="scenario.calibration",
+            source="scenario" if file is None else str(file),
+            fix="Leave it out, or give a food with a shape and a material.",
+        )
     replacements.set_in(loaded, "scenario")
     return loaded
 
@@ -236,7 +252,7 @@ def load_scenario(
 def _load(file: Path | None, given: Scenario, replacements: Replacements) -> Scenario:
     """The scenario of a file with what replaces whole fields of it."""
     try:
-        loaded = replacements.load(file, given)
+        loaded = replacements.load(file, given, _put_in_named)
     except ConfigurationError as error:
         _, _, name = (error.field or "").partition(".")
         if name in NAMED and error.problem == "expected named fields":
@@ -257,36 +273,21 @@ def _load(file: Path | None, given: Scenario, replacements: Replacements) -> Sce
     return loaded
 
 
-def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:
-    """Puts the named knife and the calibrated food in, where `given` does not have them yet."""
-    if scenario.knife_name not in (None, given.knife_name):
-        beside = Knife() if scenario.knife == given.knife else scenario.knife
-        scenario.knife = _named_knife(scenario.knife_name, beside, source)
-    if scenario.calibration not in (None, given.calibration):
-        if not isinstance(scenario.food, Food):
-            raise ConfigurationError(
-                "is of a food of finite elements",
-                field="scenario.calibration",
-                source=source,
-                fix="Leave it out, or give a food with a shape and a material.",
-            )
-        calibrated = load_calibrated_food(scenario.calibration)
-        scenario.food = calibrated.apply_to(scenario.food)
+def _put_in_named(scenario: Scenario, merge: Callable[[Scenario], Scenario]) -> Scenario:
+    """Puts the named knife and the calibrated food in, where the scenario does not have them yet.
+
+    What stands beside the names, which `merge` puts over them, wins.
+    """
+    knife, food = scenario.knife_name, scenario.calibration
+    found: dict[str, Any] = {}
+    names: dict[str, Any] = {}
+    if knife is not None and not isinstance(knife, _PutIn):
+        found["knife"] = load_knife(knife, "scenario.knife_name").knife
+        names["knife_name"] = _PutIn(knife)
+    if food is not None and not isinstance(food, _PutIn) and isinstance(scenario.food, Food):
+        calibrated = load_calibrated_food(food)
+        found["food"] = calibrated.apply_to(scenario.food)
         if calibrated.bench != BenchErrors():
-            scenario.bench = calibrated.bench
-    if scenario.preparation is not None and scenario.preparation.peeled:
-        if isinstance(scenario.food, Food):
-            scenario.food.effects.skin.toughness = 0.0
-
-
-def _named_knife(name: str, given: Knife, source: str) -> Knife:
-    """The knife of a name; one that is given beside must be that or the default."""
-    knife = load_knife(name, "scenario.knife_name").knife
-    if given not in (Knife(), knife):
-        raise ConfigurationError(
-            f"cannot stand beside knife_name, which is {name!r}",
-            field="scenario.knife",
-            source=source,
-            fix="Leave out one of knife and knife_name, or give the knife a file of its own.",
-        )
-    return knife
+            found["bench"] = calibrated.bench
+        names["calibration"] = _PutIn(food)
+    return dc.replace(merge(dc.replace(scenario, **found)), **names) if found else scenario

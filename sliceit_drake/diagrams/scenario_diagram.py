@@ -109,6 +109,12 @@ def _policy_system(own: OwnPolicy, station: Station, duration: float) -> LeafSys
         return own
     if callable(own):
         return own(station)
+    if not hasattr(own, "decide"):
+        raise ConfigurationError(
+            f"{type(own).__name__} has no method decide",
+            field="policy",
+            fix="Give an object that has one, a system, or what makes a system for a station.",
+        )
     scenario = station.scenario
     config = scenario.policy
     if not isinstance(config, PolicyConfig):

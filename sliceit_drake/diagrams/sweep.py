@@ -12,6 +12,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, unit_of
 from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
@@ -266,6 +267,11 @@ def _on_motion(
         if stands is not None:
             raise ConfigurationError(
                 "needs the robot", field=f"scenario.{field}", fix="Leave robot=False out."
+            )
+    for scenario in scenarios:
+        if scenario.bench != BenchErrors():
+            raise ConfigurationError(
+                "is of a station", field="scenario.bench", fix="Leave it or robot=False out."
             )
     prepared: dict[int, tuple[CuttingModel, Motion]] = {}
     found = [SweptSlice(point) for point in points]

@@ -160,14 +160,20 @@ class SlicingEnv(gymnasium.Env):
             options: "food": one of the task's foods, instead of a random one.
 
         Raises:
-            ValueError: The task has no such food.
+            ValueError: The task has no such food, or there is no such option. All stays as it was.
         """
+        foods, randomization = self.task.foods, self.task.randomization
+        if unknown := set(options or {}) - {"food"}:
+            raise ValueError(f"there is no option {sorted(unknown)}; there is food.")
+        if options and options["food"] not in foods:
+            raise ValueError(
+                f"the task has no food {options['food']!r}; it has {', '.join(foods)}."
+            )
         super().reset(seed=seed)
         rng = self.np_random
         state = copy.deepcopy(rng.bit_generator.state)
         self._moment = {"random": state, "options": options, "actions": []}
         self._ended = False
-        foods, randomization = self.task.foods, self.task.randomization
         food = foods[int(rng.integers(len(foods)))]
         low, high = randomization.height
         up = float(rng.uniform(low, high))
@@ -175,8 +181,6 @@ class SlicingEnv(gymnasium.Env):
         turn = float(rng.uniform(-1.0, 1.0)) * randomization.tilt
         which = int(rng.integers(randomization.stations))
         food = (options or {}).get("food", food)
-        if food not in foods:
-            raise ValueError(f"the task has no food {food!r}; it has {', '.join(foods)}.")
         self._current = station, simulator = self._station(food, which)
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)

@@ -340,7 +340,16 @@ class CuttingSystem(KnifeForceSystem):
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
         self.solvers[index].compile()
-        check_clear(self.solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
+        try:
+            check_clear(self.solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
+        except CuttingError as error:
+            if self.progress(context) == 0.0:
+                raise
+            raise CuttingError(
+                "this context is in the middle of a cut, which no start can come from. To go on "
+                "with it, call Simulator.Initialize("
+                "InitializeParams(suppress_initialization_events=True)) first."
+            ) from error
 
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform

@@ -1,5 +1,6 @@
 """The ports that every cutting system has; a subclass says what force the food gives."""
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -25,6 +26,8 @@ LAST_POSE = slice(2, 14)
 _START_TIME = 14
 KEPT = 15
 """Numbers that every cutting system keeps; those of a subclass stand behind them."""
+TINY = 1e-6
+"""What rounding may put a fraction out of its range."""
 
 
 class CuttingSetup(Protocol):
@@ -123,7 +126,7 @@ class KnifeForceSystem(ReportingSystem):
         Returns:
             Wrench F_K_W on the knife, moment and force [6], and the share that is cut.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no method advance")
 
     def knife_velocity(self, context: Context) -> SpatialVelocity:
         """V_WK now."""
@@ -166,7 +169,19 @@ class KnifeForceSystem(ReportingSystem):
         if context.get_time() <= kept[_START_TIME]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
-        new, progress = self.advance(context, state, X_WK)
+        found = self.advance(context, state, X_WK)
+        try:
+            new, progress = found
+            # A sum with a NaN or an infinity in it is none either.
+            is_right = len(new) == 6 and math.isfinite(sum(new)) and -TINY <= progress <= 1.0 + TINY
+        except (TypeError, ValueError):
+            is_right = False
+        if not is_right:
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s "
+                f"{type(self).__name__}.advance returned {found!r}. It has to return the wrench on "
+                "the knife, six finite numbers, and the fraction that is cut, within 0 and 1."
+            )
         last, now = kept[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
         wrench = x.get_mutable_value(self._wrench)
         kept[_COUPLING] += (wrench - new).dot(small_motion(last, now))

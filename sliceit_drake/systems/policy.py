@@ -238,19 +238,27 @@ class PolicySystem(PlainSystem):
         history = np.vstack([seen[1:], wrench])
         with self.watch():
             action = config.decide.decide(PolicyObservation(context.get_time(), offset, history))
+        when = f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s"
+        if not isinstance(action, PolicyAction):
+            raise RuntimeError(
+                f"{when} {type(config.decide).__name__}.decide returned {action!r}, and no "
+                "PolicyAction."
+            )
         wanted = np.array([action.draw, action.press], float)
         if not np.isfinite(wanted).all():
-            raise RuntimeError(
-                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s the policy decided "
-                f"for speeds of {wanted} m/s."
-            )
+            raise RuntimeError(f"{when} the policy decided for speeds of {wanted} m/s.")
         wanted *= min(1.0, config.speed / max(1e-12, math.hypot(*wanted)))
         motion = [*offset, *speed, *wanted, context.get_time()]
         discrete_state.set_value(self._motion, motion)
         discrete_state.set_value(self._wrenches, history.ravel())
-        given = (action.stiffness, action.p_gains)
-        for state, new, old in zip(self._settings, given, self._configured, strict=True):
-            discrete_state.set_value(state, old if new is None else new)
+        for state, name, old in zip(
+            self._settings, ("stiffness", "p_gains"), self._configured, strict=True
+        ):
+            new = getattr(action, name)
+            new = old if new is None else np.asarray(new, float)
+            if new.shape != (6,) or not np.isfinite(new).all():
+                raise RuntimeError(f"{when} the policy's {name} are {new}, and not six numbers.")
+            discrete_state.set_value(state, new)
 
     def _moved(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
         """Offset [2], m, and speeds [2], m/s, at the context's time."""

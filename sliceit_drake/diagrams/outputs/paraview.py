@@ -5,6 +5,7 @@ run.advance()
 write_series(frames, Path("output/cucumber/paraview"))
 """
 
+import json
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -225,6 +226,15 @@ def run_again(
                 source=str(folder),
                 fix="Give the folder that `sliceit simulate --output FOLDER` wrote.",
             )
+    summary = folder / "summary.json"
+    own = json.loads(summary.read_text(encoding="utf-8")).get("own") if summary.is_file() else None
+    if own:
+        raise ConfigurationError(
+            f"the run had the user's own {' and '.join(own)}, which its folder does not have",
+            source=str(folder),
+            fix="Take the shapes in your program: FoodFrames and write_series of "
+            "sliceit_drake.diagrams.outputs.paraview.",
+        )
     kept = read_columns(folder / "record.csv", ["time", "food_wrench_f_z"])
     run = prepare_run(load_scenario(folder / "scenario.yaml"))
     frames, duration = FoodFrames(run, fps), float(kept["time"][-1])
