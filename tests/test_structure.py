@@ -84,6 +84,18 @@ def test_left_out_depth_shows_an_overfit_as_blocks_that_are_held_out_do():
         assert left_out == pytest.approx(blocked_error(model, fit.unit).rms, rel=0.2)
 
 
+@pytest.mark.second_tier
+def test_elements_are_compared_with_a_plain_food_that_is_fitted_to_its_end():
+    setup, record = (
+        load_setup("cucumber"),
+        load_record(resource_path("calibration/records/cucumber.csv")),
+    )
+    found = structure._Search(setup, [record], 1, None)
+    plain = found.current
+    end = structure._fit(plain.predictor, plain.setup, plain.values, 40)
+    assert plain.left_out < 1.02 * end.left_out and plain.rms < 1.02 * end.rms
+
+
 ELEMENTS = structure._elements
 
 
@@ -237,7 +249,7 @@ def test_a_skin_of_the_setup_that_a_coarse_mesh_cannot_show_is_taken_on_the_setu
     def fitted(setup, error):
         return SimpleNamespace(setup=setup, values={}, left_out=error, rms=error)
 
-    monkeypatch.setattr(structure, "_fit", lambda predictor, setup, start: fitted(setup, 1.0))
+    monkeypatch.setattr(structure, "_fit", lambda predictor, setup, *_: fitted(setup, 1.0))
     # On the coarse mesh no element promises anything.
     monkeypatch.setattr(structure, "_trials", lambda *_: [])
     whole = left_out and fitted(tomato, left_out)
@@ -258,7 +270,7 @@ def test_left_out_depth_is_asked_by_fits_where_linear_ones_refuse_what_records_a
     # Linear ones see a snap, and give the skin ten times its error on the records.
     whole = dc.replace(plain, rms=0.3, left_out=3.0, predictor="with")
     errors = {"without": 1.0, "with": refitted}
-    monkeypatch.setattr(structure, "_fit", lambda _, setup, __: dc.replace(plain, setup=setup))
+    monkeypatch.setattr(structure, "_fit", lambda _, setup, *__: dc.replace(plain, setup=setup))
     monkeypatch.setattr(structure, "_trials", lambda *_: [])
     monkeypatch.setattr(structure, "_as_given", lambda *_: whole)
     monkeypatch.setattr(

@@ -39,6 +39,8 @@ __all__ = [
     "values_of",
 ]
 
+POLISH_STEPS = 10
+"""Most steps of the fit from each place that was found."""
 HELD_OUT_STEPS = 4
 """Most steps of a refit without a block of depth."""
 PLACE_STEPS = 6
@@ -131,18 +133,25 @@ def calibrate(
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
         refinements = _refine(setup, records, directory, options, found, problem, show)
     best = (np.inf, refinements[0].unit)
+    steps = len(refinements) * POLISH_STEPS
     for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
-        show("polish", k, len(refinements), best[0])
-        unit = gauss_newton(predictor, refinement.unit).unit
+        error = min(best[0], refinement.error)
+
+        def step(taken: int, k: int = k, error: float = error) -> None:
+            show("polish", k * POLISH_STEPS + taken, steps, error)
+
+        unit = gauss_newton(predictor, refinement.unit, steps=POLISH_STEPS, progress=step).unit
         (row,) = predictor.predict([unit])
         error = predictor.error(row)
         if error < best[0]:
             best = (error, unit)
-    show("polish", len(refinements), len(refinements), best[0])
+    show("polish", steps, steps, best[0])
     polished_rms, unit = best
     if not np.isfinite(polished_rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
+    show("uncertainty", 0, 1, polished_rms)
     estimated = estimate(predictor, unit)
+    show("uncertainty", 1, 1, polished_rms)
     unit, posterior = estimated.unit, estimated.posterior
     (predictions,) = predictor.predict([unit])
     rms = predictor.error(predictions)
@@ -150,10 +159,14 @@ def calibrate(
     blocks: list[float] = []
     held_out_rms = None
     if options.blocks:
-        show("held-out blocks", 0, options.blocks, rms)
-        result = blocked_error(predictor, unit, options.blocks, options.block_length)
+        result = blocked_error(
+            predictor,
+            unit,
+            options.blocks,
+            options.block_length,
+            lambda done: show("held-out blocks", done, options.blocks, rms),
+        )
         blocks, held_out_rms = result.blocks, result.rms
-        show("held-out blocks", options.blocks, options.blocks, rms)
     return Calibration(
         predictor,
         unit,
@@ -304,7 +317,11 @@ class HeldOutError:
 
 
 def blocked_error(
-    model: Predictor, unit: np.ndarray, blocks: int = 5, length: float | None = None
+    model: Predictor,
+    unit: np.ndarray,
+    blocks: int = 5,
+    length: float | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> HeldOutError:
     """Holds out blocks of depth in turn, in all records at once.
 
@@ -318,14 +335,17 @@ def blocked_error(
         unit: The fit to all data [d]; each refit starts there.
         blocks: Number of blocks of equal depth.
         length: As of `depth_blocks`.
+        progress: Called with the number of blocks that are done.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
+    show = progress or (lambda _: None)
     block = depth_blocks(model, blocks, length)
     shared = np.array([p.shared for p in model.parameters])
     errors, counts, squares = [], [], 0.0
     for k in range(blocks):
+        show(k)
         held, rest = (block == k) & model.used, model.used & (block != k)
         if not held.any() or not rest.any():
             continue
@@ -336,6 +356,7 @@ def blocked_error(
         errors.append(float(np.sqrt(np.mean(error**2))))
         counts.append(int(held.sum()))
         squares += float((error**2).sum())
+    show(blocks)
     return HeldOutError(errors, counts, float(np.sqrt(squares / max(sum(counts), 1))))
 
 

@@ -1,7 +1,7 @@
 """Least squares by Gauss and Newton with Levenberg's and Marquardt's damping, within the ranges."""
 
 import dataclasses as dc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -104,6 +104,7 @@ def gauss_newton(
     steps: int = 10,
     tolerance: float = 1e-4,
     linearisation: Linearisation | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Fit:
     """Minimises the sum of squares within the unit ranges.
 
@@ -121,6 +122,7 @@ def gauss_newton(
         steps: Most steps.
         tolerance: Ends where the linear problem promises a smaller relative decrease.
         linearisation: At `start`, if it is there already.
+        progress: Called before each step with the number of those taken.
 
     Raises:
         CuttingError: A slice breaks down at the start.
@@ -130,6 +132,8 @@ def gauss_newton(
     cost = _cost(at.residuals, at.unit, noise)
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
+        if progress is not None:
+            progress(taken)
         H, g = _normal_equations(at, noise)
         move = linear_step(H, g, at.unit, 0.0, free)
         promised = float(-2.0 * g @ move - move @ H @ move)

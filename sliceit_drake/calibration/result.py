@@ -65,11 +65,14 @@ class Calibration:
 
     def table(self) -> str:
         """Parameters with 90 % intervals, which of them are not determined, errors, warnings."""
+        before = f"at the start {self.search_rms:.3f}"
+        if self.refined_rms != self.search_rms:
+            before = f"search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}"
         lines = [
             self.posterior.table(),
             *self.posterior.remarks(),
-            f"RMS error: search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}, "
-            f"polished {self.polished_rms:.3f}, with these values {self.rms:.3f} N",
+            f"RMS error: {before}, polished {self.polished_rms:.3f}, with these values "
+            f"{self.rms:.3f} N",
         ]
         if self.held_out_rms is not None:
             blocks = ", ".join(f"{b:.2f}" for b in self.blocks)

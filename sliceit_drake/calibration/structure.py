@@ -51,8 +51,9 @@ __all__ = [
 
 COARSE = 0.5
 """Elements along an edge, relative to those of the setup."""
-STEPS = 5
-"""Most steps of each fit."""
+STEPS, STEPS_OF_PLAIN = 5, 25
+"""Most steps of each fit, and of the plain food's best: what that one has not come to yet would be
+taken for the gain of an element."""
 BLOCKS = 5
 """Of depth that are left out in turn."""
 FITTED, OF_ONE = 5, 2
@@ -262,7 +263,9 @@ class _Search:
         self._minima = _best_first([_fit(first, plain, start) for start in first_starts(first)])
         if not self._minima:
             raise CuttingError("no start of the plainest structure could be cut; widen the ranges")
-        self.current = self._minima[0]
+        best = self._minima[0]
+        self.current = _fit(first, plain, best.values, STEPS_OF_PLAIN) or best
+        self._minima[0] = self.current
         self.taken: list[str] = []
         self.warnings: list[str] = []
         self.lines = puncture_lines(setup, first.targets)
@@ -505,11 +508,11 @@ def first_starts(predictor: Predictor) -> list[dict[str, float]]:
 
 
 def _fit(
-    predictor: Predictor, setup: CalibrationSetup, start: Mapping[str, float]
+    predictor: Predictor, setup: CalibrationSetup, start: Mapping[str, float], steps: int = STEPS
 ) -> _Fitted | None:
     """The fit from a start, by name; None where slices break down."""
     try:
-        fit = gauss_newton(predictor, predictor.places(start), steps=STEPS, tolerance=1e-3)
+        fit = gauss_newton(predictor, predictor.places(start), steps=steps, tolerance=1e-3)
         at = fit.linearisation
         if not np.array_equal(at.unit, fit.unit):
             at = linearise(predictor, fit.unit)

@@ -243,7 +243,7 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
 def _interrupted(program: str, options: argparse.Namespace | None = None) -> int:
     """Says how to go on after Ctrl-C."""
     output = getattr(options, "output", None)
-    if getattr(options, "resumes", False) and output is not None:
+    if getattr(options, "resumes", False) and output is not None and output.exists():
         hint = f"What is done is in {output}; the same command goes on."
     else:
         hint = "The same command starts again."

@@ -10,7 +10,7 @@ SIMULATED_TIME = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s {postf
 
 
 class StageBars(ExitStack):
-    """One bar for each stage, made when the stage begins.
+    """One bar for each stage, made when the stage begins and closed when all of it is done.
 
     Args:
         prefix: Text before the stages' names.
@@ -26,13 +26,15 @@ class StageBars(ExitStack):
         """Moves a stage's bar to `done` of `total`, None if unknown, with a remark behind it."""
         from tqdm import tqdm
 
-        if stage not in self._bars:
-            # A delay leaves out the bar that tqdm draws before anything is done.
-            bar = tqdm(total=total, desc=f"{self._prefix}{stage}", delay=1e-9, **self._style)
+        bar = self._bars.get(stage)
+        # A closed bar does nothing more; a stage may come again.
+        if bar is None or (bar.disable and done < bar.n):
+            bar = tqdm(total=total, desc=f"{self._prefix}{stage}", **self._style)
             self._bars[stage] = self.enter_context(bar)
-        bar = self._bars[stage]
         bar.set_postfix_str(remark, refresh=False)
         bar.update(done - bar.n)
+        if total is not None and done >= total:
+            bar.close()
 
     def show_error(self, stage: str, done: int, total: int, error: float) -> None:
         """The same, with the best error so far, N."""

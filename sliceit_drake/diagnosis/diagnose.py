@@ -125,6 +125,11 @@ def diagnose(
         if again.verdict.misfit >= result.verdict.misfit:
             break
         factors, result = there, again
+    if other := [f"{n} times {factor:.2f}" for n, factor in factors.items() if factor != 1.0]:
+        result.remarks.append(
+            f"Simulated here is the food with {', '.join(other)}, beside which the simulation is "
+            "less wrong by itself. Its force may be farther from the records'."
+        )
     result.setup = setup
     result.shifts = {
         n: (factors[n] * factor, error) for n, (factor, error) in result.shifts.items()

@@ -265,6 +265,9 @@ def _shade(
                 axis.axvspan(*ends, fill=False, edgecolor="#6b7280", lw=1.2, zorder=1)
 
 
+LEAST_LIMIT = 1.0
+"""What chance gives at most, at least: twice the gain in log-likelihood. A cause that the bootstrap
+never liked would have infinite evidence."""
 PLAIN = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
 
 
@@ -278,7 +281,7 @@ def _evidence_panels(bars: "Axes", intervals: "Axes", result: Result) -> None:
     places = np.arange(len(ranked))[::-1]
     for e, y in zip(ranked, places, strict=True):
         color = EXTENDED if e.name in named else "#fdba74" if e.name in group else "#9ca3af"
-        bars.barh(y, max(e.gain / max(e.limit, 1e-9), 0.02), color=color, height=0.55)
+        bars.barh(y, e.gain / max(e.limit, LEAST_LIMIT), color=color, height=0.55)
         best = int(np.argmax(np.abs(e.coefficients) / np.maximum(e.errors, 1e-12)))
         column, cause = e.columns[best], result.causes[e.name]
         null = cause.parameter(column.parameter).null
@@ -293,7 +296,8 @@ def _evidence_panels(bars: "Axes", intervals: "Axes", result: Result) -> None:
         intervals.text(0.03, y + 0.16, text, fontsize=8, va="bottom", transform=across, bbox=PLAIN)
     bars.axvline(1.0, color=MEASURED, lw=1.0)
     bars.set_yticks(places, names, fontsize=9)
-    bars.set_xscale("log")
+    bars.set_xscale("symlog", linthresh=1.0)
+    bars.set_xlim(left=0.0)
     bars.set_xlabel("evidence, in what chance\ngives at most (95 %)", fontsize=9)
     bars.set_title("evidence", loc="left", fontsize=10)
     intervals.axvline(0.0, color=MEASURED, lw=1.0)
@@ -405,10 +409,11 @@ def evidence_figure(screening: Screening) -> "Figure":
     bars, matrix = figure.subplots(1, 2)
     causes = screening.causes[::-1]
     places = np.arange(len(causes))
-    bars.barh(places, [max(e.gain, 0.1) for e in causes], color=PREDICTED, label="these records")
+    bars.barh(places, [e.gain for e in causes], color=PREDICTED, label="these records")
     bars.plot([e.limit for e in causes], places, "k|", ms=9, label="95 % where nothing is wrong")
     bars.set_yticks(places, [e.name for e in causes], fontsize=7)
-    bars.set_xscale("log")
+    bars.set_xscale("symlog", linthresh=1.0)
+    bars.set_xlim(left=0.0)
     bars.set_xlabel("twice the gain in log-likelihood")
     bars.legend(frameon=False, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     shown = matrix.imshow(screening.angles, vmin=0.0, vmax=90.0, cmap="viridis")

@@ -170,7 +170,7 @@ class Diagnosis:
                 f"{e.name:20}{e.gain:10.1f}{e.expected:11.1f}{e.limit:12.1f}{visible:9.0f}"
             )
         for name, (factor, error) in self.shifts.items():
-            if abs(np.log(factor)) > 2.0 * error:
+            if self._is_understood() and abs(np.log(factor)) > 2.0 * error:
                 lines.append(f"Shift of {name}: times {factor:.3f} (+-{error:.3f})")
         return "\n".join(lines + self.remarks)
 
@@ -214,14 +214,17 @@ class Diagnosis:
 
         The note names the causes that it cannot hold.
         """
-        # What is not understood, or may be the slices, is no reason to change a food.
-        sure = self.verdict.kind in ("cause", "causes", "nothing")
-        food, left = self._extension(self.verdict.findings) if sure else self._extension([], False)
+        findings = self.verdict.findings if self._is_understood() else []
+        food, left = self._extension(findings, self._is_understood())
         food.records = [r.name for r in self.problem.found.records]
         food.known_error = self.known
         food.date = datetime.date.today().isoformat()
         food.note = f"Not in this file: {', '.join(left)}." if left else ""
         return food
+
+    def _is_understood(self) -> bool:
+        """Whether shifts and causes can be told; what is left, or the slices, may be in them."""
+        return self.verdict.kind in ("cause", "causes", "nothing")
 
     def _extension(
         self, findings: list[Finding], shifted: bool = True
