@@ -351,23 +351,3 @@ def test_a_food_that_slips_is_refused():
     model = cut(Effects(compliance=Compliance(0.0, 1e-5), slip=Slip(5.0)))
     with pytest.raises(ValueError, match="slip"):
         SliceAdjoint(model, PERIOD).run(*path(model))
-
-
-@pytest.mark.second_tier  # Which has torch.
-def test_torch_differentiates_a_slice_by_parameters_and_path(everything):
-    torch = pytest.importorskip("torch")
-    from sliceit_drake.calibration.gradient import slice_force
-
-    values = {
-        "material.toughness": torch.tensor(350.0, dtype=torch.float64, requires_grad=True),
-        "point_scales.friction": torch.ones(len(everything.model.point_nodes)).double(),
-    }
-    values["point_scales.friction"].requires_grad_()
-    height = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
-    p = torch.from_numpy(everything.p) + height * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    force = slice_force(everything.adjoint, torch.from_numpy(everything.R), p, values)
-    (force * torch.from_numpy(everything.weights)).sum().backward()
-    expected = pull_back(everything.model, everything.gradient, list(values))
-    for name, value in values.items():
-        np.testing.assert_allclose(value.grad.numpy(), expected[name], rtol=1e-12)
-    assert float(height.grad) == pytest.approx(everything.gradient.position.sum(0)[2], rel=1e-12)

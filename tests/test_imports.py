@@ -45,7 +45,7 @@ def test_every_import_points_the_allowed_way():
         ("cutting/board.py", "import pydrake.math", "know no Drake"),
         ("diagnosis/cause.py", "from sliceit_drake.stand_in import effect", "see the stand-in"),
         ("learning/training.py", "import sliceit_drake.stand_in.world", "Training never sees"),
-        ("systems/agent.py", "import torch", "import PyTorch"),
+        ("systems/agent.py", "import torch", "imports PyTorch"),
         ("emulator/modes.py", "import rtde_receive", "imports ur_rtde"),
     ],
 )
