@@ -130,8 +130,9 @@ def test_intervals_of_the_linear_problem_cover_the_truth_as_often_as_they_say():
         model.measured = force - noise_of(model, 0.2, 0.1, 0.1, 0.2, force).sample(rng, len(force))
         mean, reach = white_noise_interval(model, truth)
         naive.append(np.abs(mean - truth) < reach)
-        result = estimate(model, mean, rounds=1).posterior
-        variation.append(result.record_variation)
+        estimated = estimate(model, mean, rounds=1)
+        result = estimated.posterior
+        variation.append(estimated.noise.record_scale)
         reach = 1.645 * result.deviation
         covered.append(np.abs(np.array(result.mean) - truth) < reach)
     share = np.mean(covered, axis=0)
@@ -159,9 +160,9 @@ def shapes(n, d):
 
 def test_a_single_record_is_said_to_tell_nothing_of_how_slices_differ():
     model, truth = small_model(shapes(120, 2))
-    posterior = estimate(model, truth).posterior
-    assert posterior.record_variation is None
-    assert any("no cut was repeated" in line for line in posterior.remarks())
+    estimated = estimate(model, truth)
+    assert estimated.noise.record_scale is None
+    assert any("no cut was repeated" in line for line in estimated.posterior.remarks())
 
 
 def test_least_squares_stand_where_the_noise_gives_up_the_force_of_a_model_that_lacks_something():
@@ -255,7 +256,6 @@ def example_posterior():
         log=[True, False, True],
         mean=[0.95, 0.5, 0.4],
         covariance=[[0.01, 0.0, 0.0], [0.0, 2.5e-3, -1.8e-3], [0.0, -1.8e-3, 2.0e-3]],
-        effective_samples=31.5,
         notes=["a note"],
     )
 

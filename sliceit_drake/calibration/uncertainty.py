@@ -14,7 +14,6 @@ from sliceit_drake.calibration.gauss_newton import (
     residuals_at,
 )
 from sliceit_drake.calibration.prediction import HEIGHT, Predictor
-from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.foods.distribution import (
     DETERMINED,
     PRIOR_DEVIATION,
@@ -49,16 +48,9 @@ class Posterior(ParameterDistribution):
     """What records say of all parameters, those of single records included.
 
     Attributes:
-        effective_samples: Independent samples that would be worth as much as those of the records.
-        record_variation: Relative standard deviation of the force between slices, or null where no
-            cut was repeated.
         notes: What a reader must know.
     """
 
-    effective_samples: float = quantity(0.0, "", low=0.0, high=1e12)
-    """In number."""
-    record_variation: float | None = quantity(None, "", low=0.0, high=10.0)
-    """Relative, between slices."""
     notes: list[str] = dc.field(default_factory=list)
 
     def shared(self) -> ParameterDistribution:
@@ -343,7 +335,5 @@ def _posterior(
         log=[p.log for p in parameters],
         mean=unit.tolist(),
         covariance=covariance.tolist(),
-        effective_samples=noise.effective_samples,
-        record_variation=noise.record_scale,
         notes=notes,
     )
