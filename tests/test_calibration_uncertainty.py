@@ -24,6 +24,7 @@ from studies.calibration.coverage import (
     coverage_page,
     coverage_share,
     coverage_study,
+    noise_sample,
     synthetic_predictor,
 )
 from studies.calibration.profile_likelihood import profile_likelihood
@@ -107,7 +108,7 @@ def test_covariance_of_a_record_is_that_of_an_autoregressive_process_with_white_
     V += same * np.outer(prediction, prediction) * 0.2**2
     B = np.random.default_rng(0).normal(size=(len(t), 4))
     assert np.allclose(noise.solve(B), np.linalg.solve(V, B), rtol=1e-8, atol=1e-8)
-    sample = np.array([noise.sample(np.random.default_rng(k), len(t)) for k in range(4000)])
+    sample = np.array([noise_sample(noise, np.random.default_rng(k), len(t)) for k in range(4000)])
     assert np.abs(sample.T @ sample / 4000 - V).max() < 6.0 * V.max() / np.sqrt(4000)
 
 
@@ -127,7 +128,8 @@ def test_intervals_of_the_linear_problem_cover_the_truth_as_often_as_they_say():
         model = linear_model()
         truth = rng.uniform(0.3, 0.7, 3)
         force = model.function(truth)
-        model.measured = force - noise_of(model, 0.2, 0.1, 0.1, 0.2, force).sample(rng, len(force))
+        noise = noise_of(model, 0.2, 0.1, 0.1, 0.2, force)
+        model.measured = force - noise_sample(noise, rng, len(force))
         mean, reach = white_noise_interval(model, truth)
         naive.append(np.abs(mean - truth) < reach)
         estimated = estimate(model, mean, rounds=1)
@@ -188,7 +190,7 @@ def test_the_covariance_of_least_squares_is_that_of_many_repetitions():
         truth = np.full(3, 0.5)
         force = model.function(truth)
         noise = noise_of(model, 0.2, 0.1, 0.1, 0.2, force)
-        model.measured = force - noise.sample(rng, len(force))
+        model.measured = force - noise_sample(noise, rng, len(force))
         fits.append(gauss_newton(model, truth).unit)
         if k < 30:
             problem = uncertainty._noise_problem(model, linearise(model, fits[-1]))

@@ -155,15 +155,6 @@ class NoiseModel:
         variance = (self.ar**2 + self.white**2) @ [len(g.rows) for g in self.groups]
         return EvenNoise(float(variance) / self.effective_samples)
 
-    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """A sample of the noise [size]; entries that are not used are zero."""
-        out = np.zeros(size)
-        for group, V in zip(self.groups, self._covariances(), strict=True):
-            out[group.rows] = V.sample(rng)
-        if self.record_scale is not None:
-            out += self.scales @ rng.normal(0.0, self.record_scale, self.scales.shape[1])
-        return out
-
 
 class MarkovCovariance:
     """ar^2 exp(-|dt|/tau) + diag(white^2); entries an infinite gap apart are independent.

@@ -29,7 +29,7 @@ from sliceit_drake.calibration.uncertainty import estimate
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.workers import worker_processes
-from sliceit_drake.prediction.noise import NoiseModel, group_series
+from sliceit_drake.prediction.noise import MarkovCovariance, NoiseModel, group_series
 from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord, velocities
 from studies.pages import publish, render
@@ -44,6 +44,7 @@ __all__ = [
     "coverage_page",
     "coverage_share",
     "coverage_study",
+    "noise_sample",
     "run",
     "synthetic_predictor",
 ]
@@ -250,10 +251,21 @@ def synthetic_predictor(
     ar, tau, white = (np.full(len(groups), v) for v in (problem.ar, problem.tau, problem.white))
     scales = force[:, None] * (predictor.record_of[:, None] == np.arange(len(records)))
     noise = NoiseModel(groups, ar, tau, white, problem.record_scale, scales)
-    measured = predictor.split(force + noise.sample(rng, len(force)))
+    measured = predictor.split(force + noise_sample(noise, rng, len(force)))
     for target, series in zip(predictor.targets, measured, strict=True):
         target.measured = series
     return predictor, truth
+
+
+def noise_sample(noise: NoiseModel, rng: np.random.Generator, size: int) -> np.ndarray:
+    """A sample of the noise [size]; entries that are not used are zero."""
+    out = np.zeros(size)
+    numbers = zip(noise.groups, noise.ar, noise.tau, noise.white, strict=True)
+    for group, *own in numbers:
+        out[group.rows] = MarkovCovariance(group.gap, *own).sample(rng)
+    if noise.record_scale is not None:
+        out += noise.scales @ rng.normal(0.0, noise.record_scale, noise.scales.shape[1])
+    return out
 
 
 def _run_replicate(problem: Problem, number: int) -> Replicate:
