@@ -1,7 +1,6 @@
 """How a UR controller's ``servoj`` turns streamed joint targets into a motion of the arm."""
 
 import dataclasses as dc
-import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,11 +35,6 @@ class ServoConfig:
     def lag(self) -> float:
         """Time by which the arm trails a target that moves at constant speed, seconds."""
         return self.lookahead_time + self.delay
-
-    @property
-    def damping_ratio(self) -> float:
-        """Damping of the response; a step overshoots below 1 (5.8 % at the defaults)."""
-        return 0.5 * self.lookahead_time * math.sqrt(self.gain)
 
 
 class ServoLaw:
