@@ -6,6 +6,7 @@ from sliceit_drake.cutting.kernels.types import CORNERS, LANES
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.cutting.warp_start import LAUNCH_LOCK
+from studies.disect.contact_sums import point_forces
 
 
 def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.ndarray:
@@ -15,7 +16,7 @@ def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.nd
     with LAUNCH_LOCK:
         ws.launch_look_ahead()
         ws.launch_part("elements", 0)
-        point_forces = ws.point_forces()
+        at_points = point_forces(ws)
     forces = ws.force.numpy()[0, : m.blocks.size * 3].astype(np.float64)
     held = np.ones(len(m.nodes), bool)
     held[m.moving] = False
@@ -25,5 +26,5 @@ def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.nd
     lag = solver.field(state, "overstress").reshape(len(m.relaxing), len(m.nodes), 3)[:, m.moving]
     on_held += m.relaxing @ lag.sum(1, dtype=float)
     share = (held[m.point_nodes].reshape(-1, 2, 2) * m.point_weights[:, None, :]).sum(2)
-    on_held += (point_forces * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)
+    on_held += (at_points * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)
     return -on_held

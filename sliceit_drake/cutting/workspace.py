@@ -514,14 +514,6 @@ class Workspace:
             else:
                 self.write(array, np.broadcast_to(value, (*array.shape, *np.shape(value))))
 
-    def point_forces(self) -> np.ndarray:
-        """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
-        # A step of no duration changes no history that another call reads.
-        with LAUNCH_LOCK:
-            self.launch_part("step_points", 0, self.real(0.0))
-        forces = np.array(self.forces[0].points.numpy()[0], np.float64)
-        return forces.transpose(0, 3, 1, 2).reshape(-1, 2, 3)[: len(self.model.point_nodes)]
-
 
 FACTORS = ("lower", "upper", "inverse_pivot", "inverse")
 """Arrays of `inertia.Factors` in which cuts of one mesh differ."""

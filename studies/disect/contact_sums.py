@@ -6,8 +6,10 @@ from sliceit_drake.cutting.driver import Launch
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.motion import Motion, Pose, small_motion
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.warp_start import LAUNCH_LOCK
+from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["contact_forces", "contact_sums"]
+__all__ = ["contact_forces", "contact_sums", "point_forces"]
 
 
 def contact_forces(solver: CuttingSolver, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
@@ -25,10 +27,19 @@ def contact_forces(solver: CuttingSolver, state: np.ndarray, start: Pose, end: P
     ws.write(ws.states[0], state[None])
     motion = np.array(small_motion(np.column_stack(start), np.column_stack(end))) / T
     ws.place_knife(*end, motion[3:], motion[:3])
-    both = ws.point_forces()
+    both = point_forces(ws)
     # What is left with the knife beyond the food are the bonds, in the same state.
     ws.place_knife(end.R, end.p + 10.0 * end.R[:, 0])
-    return ws.point_forces() - both
+    return point_forces(ws) - both
+
+
+def point_forces(ws: Workspace) -> np.ndarray:
+    """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
+    # A step of no duration changes no history that another call reads.
+    with LAUNCH_LOCK:
+        ws.launch_part("step_points", 0, ws.real(0.0))
+    forces = np.array(ws.forces[0].points.numpy()[0], np.float64)
+    return forces.transpose(0, 3, 1, 2).reshape(-1, 2, 3)[: len(ws.model.point_nodes)]
 
 
 def contact_sums(solver: CuttingSolver, motion: Motion) -> np.ndarray:
