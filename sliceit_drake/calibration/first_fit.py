@@ -33,14 +33,12 @@ class FirstFit:
 
     Attributes:
         predictor: Of the records, on the coarse mesh.
-        unit: Places of the parameters in their ranges [d].
         predictions: One a record.
         rms: On the records, N.
         band: Within what another measurement is expected.
     """
 
     predictor: Predictor
-    unit: np.ndarray
     predictions: list[Prediction]
     rms: float
     band: ForceBand
@@ -75,7 +73,7 @@ def first_fit(
     predictor = coarse_predictor(setup, list(first.values())[:MOST], workers)
     unit = fit_from_starts(predictor, progress)
     (row,) = predictor.predict([unit])
-    return FirstFit(predictor, unit, row, predictor.error(row), force_band(predictor, unit))
+    return FirstFit(predictor, row, predictor.error(row), force_band(predictor, unit))
 
 
 def fit_from_starts(

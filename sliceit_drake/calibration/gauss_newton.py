@@ -57,14 +57,12 @@ class Fit:
     Attributes:
         unit: Best place [d].
         cost: Weighted sum of squares there, with the prior's where there is a noise model.
-        steps: Steps that were taken.
         converged: Whether it ended because no step promised a further decrease.
         linearisation: The last that was taken, at `unit` or one small step before.
     """
 
     unit: np.ndarray
     cost: float
-    steps: int
     converged: bool
     linearisation: Linearisation
 
@@ -138,7 +136,7 @@ def gauss_newton(
         move = linear_step(H, g, at.unit, 0.0, free)
         promised = float(-2.0 * g @ move - move @ H @ move)
         if promised <= tolerance * cost:
-            return Fit(at.unit, cost, taken, True, at)
+            return Fit(at.unit, cost, True, at)
         accepted = None
         while accepted is None and damping <= WORST_DAMPING:
             moves = [linear_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
@@ -150,18 +148,18 @@ def gauss_newton(
                 damping *= RETREAT
                 continue
             if taken + 1 == steps or cost - costs[k] <= tolerance * cost:
-                return Fit(places[k], costs[k], taken + 1, taken + 1 < steps, at)
+                return Fit(places[k], costs[k], taken + 1 < steps, at)
             try:
                 accepted = linearise(model, places[k], free)
             except CuttingError:
                 # So near to where slices break down there is no derivative.
                 damping *= RETREAT
         if accepted is None:
-            return Fit(at.unit, cost, taken, False, at)
+            return Fit(at.unit, cost, False, at)
         at, taken = accepted, taken + 1
         cost = _cost(at.residuals, at.unit, noise)
         damping = float(np.clip(damping * max(DAMPINGS[k], EASE), 1e-8, 1.0))
-    return Fit(at.unit, cost, taken, False, at)
+    return Fit(at.unit, cost, False, at)
 
 
 def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | EvenNoise | None) -> float:

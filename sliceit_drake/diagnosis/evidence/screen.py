@@ -44,8 +44,6 @@ MIN_DEVIATION = 0.5
 """Least standard deviation of a gain by chance: a gain of next to nothing proves no cause."""
 PRESENT = 5.0
 """Gain for each number of a cause from which on it shows in a record."""
-JITTER = 1e-9
-"""Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
 ESTIMATED = 3
 """Causes that gain most, and that are largest, with which sizes are estimated anew."""
 FARTHEST = 1.5
@@ -124,7 +122,6 @@ class Screening:
         names: Of the causes.
         projected: Gram matrix of all columns and y beside what is free in any case.
         assumed: Causes that are part of the model already.
-        sizes: Of the discrepancy, without other causes.
     """
 
     causes: list[CauseEvidence]
@@ -135,7 +132,6 @@ class Screening:
     names: list[str]
     projected: np.ndarray
     assumed: Sequence[CauseAtScan]
-    sizes: Sizes
 
     def evidence(self, name: str) -> CauseEvidence:
         """Evidence of one cause."""
@@ -362,7 +358,6 @@ def screen(
         names=statistics.names,
         projected=statistics.projected,
         assumed=assumed,
-        sizes=statistics.sizes,
     )
 
 
