@@ -3,6 +3,7 @@
 import base64
 import dataclasses as dc
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -354,8 +355,13 @@ def test_waiting_for_a_browser_gives_up():
         ),
     ],
 )
-def test_instructions_say_how_to_see_the_viewer(environment, platform, words, absent):
-    text = viewing_instructions(7001, environment, platform)
+def test_instructions_say_how_to_see_the_viewer(environment, platform, words, absent, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "platform", platform)
+    text = viewing_instructions(7001)
     assert all(word in text for word in words)
     assert not any(word in text for word in absent)
 

@@ -5,7 +5,6 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Mapping
 
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
@@ -65,19 +64,11 @@ def wait_for_browser(meshcat: Meshcat, timeout: float) -> bool:
     return True
 
 
-def viewing_instructions(
-    port: int, environment: Mapping[str, str] = os.environ, platform: str = sys.platform
-) -> str:
-    """How to see a viewer on this machine, which may have no display.
-
-    Args:
-        port: Of the viewer, on the loopback interface.
-        environment: Variables that tell of ssh and of a display.
-        platform: As `sys.platform`.
-    """
+def viewing_instructions(port: int) -> str:
+    """How to see a viewer at a port of this machine, which may have no display."""
     url = f"http://localhost:{port}"
     tunnel = f"ssh -N -L {port}:localhost:{port}"
-    connection = environment.get("SSH_CONNECTION", "").split()
+    connection = os.environ.get("SSH_CONNECTION", "").split()
     if len(connection) == 4:
         host, ssh_port = connection[2:]
         option = "" if ssh_port == "22" else f" -p {ssh_port}"
@@ -87,7 +78,7 @@ def viewing_instructions(
             f"then open {url} there."
         )
     displays = ("DISPLAY", "WAYLAND_DISPLAY")
-    if platform == "linux" and not any(environment.get(name) for name in displays):
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
         return (
             f"This machine has no display. On one that has, run this and leave it running:\n"
             f"    {tunnel} USER@HOST    (HOST is this machine's name)\n"
