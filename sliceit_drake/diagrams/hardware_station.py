@@ -237,10 +237,6 @@ class HardwareStation(Station):
         """Takes in where the robot is; it is moved to the start before."""
         self.rtde.receive(self.rtde.GetMyMutableContextFromRoot(root_context))
 
-    def cutting_columns(self) -> list[str]:
-        """Empty: there is no port `cutting_state`."""
-        return []
-
 
 def make_edge_kinematics(twin: Station) -> EdgeKinematics:
     """Where the edge of a scenario's knife is."""
