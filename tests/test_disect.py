@@ -17,7 +17,6 @@ from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, Pose
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.resources import resource_path
 from studies.disect import case as disect
 from studies.disect import page as disect_page
@@ -26,6 +25,7 @@ from studies.disect.contact_sums import contact_forces, contact_sums
 from studies.disect.settings import SETTINGS
 from studies.disect.study import Curve, Difference, DisectStudy, MeasuredCurves
 from studies.pages import render
+from studies.simulated_profiles import load_simulated_profile
 
 ROOT = Path(__file__).resolve().parent.parent
 TOUGHNESS = 300.0
@@ -222,7 +222,7 @@ def test_a_field_that_does_not_exist_is_named():
 
 def test_page_and_figure_show_what_the_study_found(runs, tmp_path):
     reference, ours, stiffer, stiff = runs
-    profile = load_force_profile(
+    profile = load_simulated_profile(
         resource_path("calibration/measured/sliceit_real_cucumber_force.csv")
     )
     curves = [

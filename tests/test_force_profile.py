@@ -7,6 +7,7 @@ import pytest
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records.force_profile import load_force_profile
+from studies.simulated_profiles import load_simulated_profile
 
 MEASURED = Path(__file__).resolve().parent.parent / "calibration" / "measured"
 
@@ -19,7 +20,7 @@ MEASURED = Path(__file__).resolve().parent.parent / "calibration" / "measured"
 def test_a_measured_profile_has_the_published_errors_and_duration(
     food, finite_elements, spring, duration
 ):
-    profile = load_force_profile(MEASURED / f"sliceit_real_{food}_force.csv")
+    profile = load_simulated_profile(MEASURED / f"sliceit_real_{food}_force.csv")
 
     def rms(name):
         return np.sqrt(np.mean((profile.references[name] - profile.force) ** 2))
@@ -43,7 +44,11 @@ def test_points_interpolated_over_a_gap_of_the_drawn_curve_are_told_apart():
         ("\n0.01,0.180", "\n0.01,nan", "csv, line 4: F_ground_truth_N: is 'nan'"),
         ("\n0.01,0.180", "\n0.01,-inf", "csv, line 4: F_ground_truth_N: is '-inf'"),
         ("\n0.01,0.180", "\n0.01,0;18", "csv, line 4: F_ground_truth_N: is '0;18'"),
-        ("F_gazebo_N", "F_gazebo", 'no column "F_gazebo_N".*Rename "F_gazebo"'),
+        (
+            "F_ground_truth_N",
+            "F_ground_truth",
+            'no column "F_ground_truth_N".*Rename "F_ground_truth"',
+        ),
         ("0.182,0\n", "0.182,0.5\n", "gt_from_drawn_dash: row 1 has 0.5. Write 1 where"),
     ],
 )

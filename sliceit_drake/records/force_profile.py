@@ -1,4 +1,4 @@
-"""Measured force over time of one slice, with curves of other simulators for comparison."""
+"""Measured force over time of one slice."""
 
 import dataclasses as dc
 from pathlib import Path
@@ -10,8 +10,6 @@ from sliceit_drake.tables import read_columns, require_increasing
 
 __all__ = ["ForceProfile", "load_force_profile"]
 
-_REFERENCE_COLUMNS = {"DiSECt": "F_disect_calibrated_N", "spring": "F_gazebo_N"}
-
 
 @dc.dataclass(frozen=True)
 class ForceProfile:
@@ -21,28 +19,24 @@ class ForceProfile:
         time: Float array [N], s, increasing.
         force: Measured force, float array [N], N.
         is_read: Bool array [N]: the measured curve was read there, not interpolated over a gap.
-        references: Force curves [N] of other simulators at the same times, N, by name.
     """
 
     time: np.ndarray
     force: np.ndarray
     is_read: np.ndarray
-    references: dict[str, np.ndarray]
 
 
 def load_force_profile(file: str | Path) -> ForceProfile:
     """Reads a force profile from a CSV file.
 
     Args:
-        file: CSV file with the columns time_s, F_ground_truth_N, F_disect_calibrated_N, F_gazebo_N
-            and gt_from_drawn_dash (0 or 1).
+        file: CSV file with the columns time_s, F_ground_truth_N and gt_from_drawn_dash (0 or 1).
 
     Raises:
         ConfigurationError: If the file is missing, lacks a column, has a cell that is not a finite
             number, times that do not increase or a mark other than 0 and 1.
     """
-    names = ("time_s", "F_ground_truth_N", *_REFERENCE_COLUMNS.values(), "gt_from_drawn_dash")
-    columns = read_columns(file, names)
+    columns = read_columns(file, ("time_s", "F_ground_truth_N", "gt_from_drawn_dash"))
     require_increasing(columns["time_s"], file, "time_s")
     mark = columns["gt_from_drawn_dash"]
     wrong = np.flatnonzero((mark != 0.0) & (mark != 1.0))
@@ -57,5 +51,4 @@ def load_force_profile(file: str | Path) -> ForceProfile:
         time=columns["time_s"],
         force=columns["F_ground_truth_N"],
         is_read=mark == 1.0,
-        references={name: columns[column] for name, column in _REFERENCE_COLUMNS.items()},
     )

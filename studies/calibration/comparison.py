@@ -29,11 +29,11 @@ from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from studies.figures import new_figure, save_figure
 from studies.pages import percent, publish, table
+from studies.simulated_profiles import SimulatedProfile, load_simulated_profile
 
 __all__ = [
     "FoodComparison",
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
     comparisons = []
     for food in options.foods:
         record = load_record(resource_path(f"calibration/records/{food}.csv"))
-        profile = load_force_profile(
+        profile = load_simulated_profile(
             resource_path(f"calibration/measured/sliceit_real_{food}_force.csv")
         )
         folder = options.output / food
@@ -194,7 +194,7 @@ class FoodComparison:
     per_point_rms: float | None = None
 
 
-def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> FoodComparison:
+def compare(calibration: Calibration, profile: SimulatedProfile, minutes: float) -> FoodComparison:
     """Compares on the samples that the calibration was fitted to.
 
     The other simulators' curves get the time shift that brings them nearest; ours has its own

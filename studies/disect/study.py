@@ -13,11 +13,11 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.diagrams.outputs.measurement_comparison import compare_with_measurement
-from sliceit_drake.records.force_profile import ForceProfile
 from studies.disect import case as disect
 from studies.disect.case import Case, CaseResult, Reference, ReferenceRun
 from studies.disect.contact_sums import contact_sums
 from studies.physics.measured_curves import MeasuredFood
+from studies.simulated_profiles import SimulatedProfile
 
 __all__ = ["STEPS", "Curve", "Difference", "DisectStudy", "MeasuredCurves", "disect_study"]
 
@@ -71,7 +71,7 @@ class MeasuredCurves:
     """
 
     food: str
-    profile: ForceProfile
+    profile: SimulatedProfile
     speed: float
     curves: list[Curve]
     flank_stiffness: float

@@ -26,8 +26,8 @@ from sliceit_drake.diagrams.outputs.measurement_comparison import (
     compare_with_measurement,
 )
 from sliceit_drake.diagrams.scenario import Measurement
-from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
+from studies.simulated_profiles import SimulatedProfile, load_simulated_profile
 
 __all__ = [
     "FITTED",
@@ -93,15 +93,15 @@ class MeasuredFood:
         """Area, m^2."""
         return 0.25 * np.pi * self.diameter**2
 
-    def profile(self) -> ForceProfile:
+    def profile(self) -> SimulatedProfile:
         """The measured force.
 
         Raises:
-            ConfigurationError: As `load_force_profile`.
+            ConfigurationError: As `load_simulated_profile`.
         """
-        return load_force_profile(resource_path(self.measurement.file))
+        return load_simulated_profile(resource_path(self.measurement.file))
 
-    def motion(self, model: CuttingModel, profile: ForceProfile) -> Motion:
+    def motion(self, model: CuttingModel, profile: SimulatedProfile) -> Motion:
         """Straight down at the record's speed, as deep as it goes where it begins at contact."""
         speed = self.measurement.speed
         above = model.top - self.diameter + CLEARANCE
@@ -129,7 +129,7 @@ class MeasuredCut:
     """
 
     comparison: Comparison
-    profile: ForceProfile
+    profile: SimulatedProfile
     result: SliceResult
     model: CuttingModel
 
