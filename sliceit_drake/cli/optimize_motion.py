@@ -12,6 +12,8 @@ Writes to --output:
 
 import argparse
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
     ONE_CUT,
@@ -21,6 +23,11 @@ from sliceit_drake.cli.arguments import (
     scenario_of,
 )
 from sliceit_drake.cli.progress import StageBars
+
+if TYPE_CHECKING:
+    from sliceit_drake.cutting.motion import PressAndDraw
+    from sliceit_drake.cutting.motion_optimization import MotionLimits, Optimum
+    from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = ["add_arguments", "run"]
 
@@ -56,9 +63,7 @@ def run(options: argparse.Namespace) -> int:
     import json
 
     from sliceit_drake.configuration import dump_yaml
-    from sliceit_drake.cutting.motion import PressAndDraw
     from sliceit_drake.cutting.motion_optimization import MotionLimits
-    from sliceit_drake.diagrams.optimized_scenario import optimize_scenario
 
     check_numbers(options, iterations=(1, math.inf), starts=(1, math.inf))
     limits = MotionLimits(
@@ -69,12 +74,10 @@ def run(options: argparse.Namespace) -> int:
     )
     with StageBars(unit="slice") as bars:
 
-        def show(count: int, force: float, motion: PressAndDraw) -> None:
+        def show(count: int, force: float, motion: "PressAndDraw") -> None:
             bars.show("slices", count, None, f"{force:.2f} N")
 
-        scenario, found = optimize_scenario(
-            scenario_of(options), limits, options.iterations, options.starts, show
-        )
+        scenario, found = _optimized(scenario_of(options), limits, options, show)
     motion = found.motion
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(scenario, options.output / "scenario.yaml")
@@ -90,3 +93,42 @@ def run(options: argparse.Namespace) -> int:
     print(f"limits that it touches: {', '.join(found.active) or 'none'}")
     print(f"sliceit simulate {options.output / 'scenario.yaml'} --output FOLDER")
     return 0
+
+
+def _optimized(
+    scenario: "Scenario",
+    limits: "MotionLimits",
+    options: argparse.Namespace,
+    progress: "Callable[[int, float, PressAndDraw], None]",
+) -> "tuple[Scenario, Optimum]":
+    """A scenario with the best press and draw, a hold and a retraction, for a robot to run."""
+    import dataclasses as dc
+
+    from sliceit_drake.configuration import ConfigurationError, validate
+    from sliceit_drake.cutting.foods.food import Food, make_food_model
+    from sliceit_drake.cutting.motion import Hold, MotionPlan, Retract
+    from sliceit_drake.cutting.motion_optimization import optimize_motion
+
+    if not isinstance(scenario.food, Food) or scenario.sequence is not None:
+        raise ConfigurationError(
+            "has no single cut of finite elements",
+            field="scenario.food",
+            fix="Give a scenario such as scenarios/cucumber_measured.yaml.",
+        )
+    validate(limits, "limits")
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    found = optimize_motion(
+        model,
+        limits,
+        period=scenario.exchange_period,
+        iterations=options.iterations,
+        starts=options.starts,
+        progress=progress,
+    )
+    # A robot starts and stops; and the edge starts above the food.
+    down = scenario.start.clearance + model.top - model.bottom
+    slicing = dc.replace(found.motion, distance=down + 2e-4, acceleration=limits.draw_acceleration)
+    retract = Retract(down + 0.01, 0.05, 0.5, label="retract")
+    plan = MotionPlan([slicing, Hold(0.1, label="hold"), retract])
+    # The measured curve is of another motion.
+    return dc.replace(scenario, policy=None, motion=plan, measurement=None), found
