@@ -31,6 +31,7 @@ class StageBars(ExitStack):
         if bar is None or (bar.disable and done < bar.n):
             bar = tqdm(total=total, desc=f"{self._prefix}{stage}", **self._style)
             self._bars[stage] = self.enter_context(bar)
+        bar.total = total
         bar.set_postfix_str(remark, refresh=False)
         bar.update(done - bar.n)
         if total is not None and done >= total:
