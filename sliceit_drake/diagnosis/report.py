@@ -8,23 +8,23 @@ import dataclasses as dc
 import html
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
-from sliceit_drake.diagnosis.evidence.held_out import fitted_changes
+from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, fitted_changes
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import Screening
-from sliceit_drake.diagnosis.evidence.verdict import Verdict
+from sliceit_drake.diagnosis.evidence.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sliceit_drake.diagnosis.result import Diagnosis
-
 __all__ = [
+    "Result",
     "evidence_figure",
     "html_page",
     "image",
@@ -65,6 +65,27 @@ SHIFT = 0.1
 """Logarithm of a shift of a base parameter from which on the first sentence names it."""
 OTHER_FOOD = 0.4
 """The same from which on it advises to calibrate, whatever else was found."""
+
+
+class Result(Protocol):
+    """What a report needs of a `result.Diagnosis`."""
+
+    problem: LinearProblem
+    verdict: Verdict
+    causes: dict[str, Cause]
+    gain: HeldOutGain | None
+    extension: LinearProblem | None
+    shifts: dict[str, tuple[float, float]]
+
+    def values(self, finding: Finding) -> dict[str, float]:
+        """Parameters of a finding's cause."""
+        ...
+
+    def table(self) -> str:
+        """The result in a minute."""
+        ...
+
+
 PHASES = {
     "air": "#ffffff",
     "weight": "#ffffff",
@@ -109,7 +130,7 @@ class _Place:
     extended: np.ndarray | None
 
 
-def _place(result: "Diagnosis") -> _Place:
+def _place(result: Result) -> _Place:
     """The record, channel and phase in which the extension changes most, in the noise; without one
     in which what is left is largest. Of replicates the one that is met best."""
     problem, named = result.problem, _shown(result)
@@ -139,7 +160,7 @@ def _place(result: "Diagnosis") -> _Place:
     return _Place(r, c, rows, plain[r][:, c], extended[r][:, c] if named else None)
 
 
-def _shown(result: "Diagnosis") -> list[CauseAtScan]:
+def _shown(result: Result) -> list[CauseAtScan]:
     """The causes that are named; none where it is only said which comes nearest."""
     return [] if result.verdict.kind == "unknown" else result.verdict.named
 
@@ -150,7 +171,7 @@ def _phases(labels: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(starts, [k - 1 for k in starts[1:]] + [len(labels) - 1], strict=True))
 
 
-def overview_figure(result: "Diagnosis") -> "Figure":
+def overview_figure(result: Result) -> "Figure":
     """What one sees first: where the cause shows most, measured, simulated, and simulated by the
     extended food, with phases shaded; what is left; evidence and interval of each cause."""
     from matplotlib.figure import Figure
@@ -250,7 +271,7 @@ never liked would have infinite evidence."""
 PLAIN = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
 
 
-def _evidence_panels(bars: "Axes", intervals: "Axes", result: "Diagnosis") -> None:
+def _evidence_panels(bars: "Axes", intervals: "Axes", result: Result) -> None:
     """Evidence of the causes that have most, and the interval of each one's first number."""
     ranked = result.verdict.screening.causes[:RANKED]
     names = [e.name for e in ranked]
@@ -291,7 +312,7 @@ def _short(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if 1e2 <= abs(value) < 1e6 else f"{value:.{digits}g}"
 
 
-def sentence(result: "Diagnosis") -> str:
+def sentence(result: Result) -> str:
     """What was found, in a few sentences for people who know robots and no statistics."""
     moved = _moved(result, OTHER_FOOD)
     if result.verdict.kind == "nothing" or not moved:
@@ -299,7 +320,7 @@ def sentence(result: "Diagnosis") -> str:
     return f"{_found(result)} But calibrate first: the file's food needs {', '.join(moved)}."
 
 
-def _moved(result: "Diagnosis", least: float) -> list[str]:
+def _moved(result: Result, least: float) -> list[str]:
     """Base parameters that are off by a logarithm of at least this much, and by how much."""
     return [
         f"{name.rpartition('.')[2].replace('_', ' ')} times {factor:.2f}"
@@ -308,7 +329,7 @@ def _moved(result: "Diagnosis", least: float) -> list[str]:
     ]
 
 
-def _found(result: "Diagnosis") -> str:
+def _found(result: Result) -> str:
     verdict, gain = result.verdict, result.gain
     place = _place(result)
     record = result.problem.found.records[place.record]
@@ -404,7 +425,7 @@ def evidence_figure(screening: Screening) -> "Figure":
     return figure
 
 
-def report_html(result: "Diagnosis") -> str:
+def report_html(result: Result) -> str:
     """The report as one self-contained page: a picture, a sentence, then all that was found, as
     text and figures, and the error on records that were left out, if anything is named."""
     parts = [

@@ -3,7 +3,7 @@
 import dataclasses as dc
 import importlib.metadata
 import platform
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -15,12 +15,13 @@ from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD
 from sliceit_drake.diagrams.outputs.measurement_comparison import Comparison
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
+from sliceit_drake.diagrams.stability import ContactMargin
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.contact_monitor import UNSTABLE_GAINS
 
-if TYPE_CHECKING:
-    from sliceit_drake.diagrams.run import Run
-
-__all__ = ["add_discretization_error", "run_summary", "slice_areas"]
+__all__ = ["FinishedRun", "add_discretization_error", "run_summary", "slice_areas"]
 
 CUT_THROUGH = 0.99
 """Share of a section from which it counts as cut."""
@@ -28,12 +29,35 @@ BOARD_REACHED = 5e-4
 """Height of the edge over the board below which a longer way down would not help, m."""
 
 
+class FinishedRun(Protocol):
+    """What a summary needs of a `diagrams.run.Run`."""
+
+    @property
+    def scenario(self) -> Scenario: ...
+    @property
+    def diagram(self) -> ScenarioDiagram: ...
+    @property
+    def station(self) -> Station: ...
+    @property
+    def motion(self) -> Motion: ...
+    @property
+    def contact_margin(self) -> ContactMargin | None: ...
+    @property
+    def own(self) -> dict[str, str]: ...
+    @property
+    def wall_time(self) -> float: ...
+    @property
+    def stopped(self) -> str | None: ...
+    @property
+    def warnings(self) -> list[str]: ...
+
+
 def _phase_times(mask: np.ndarray, time: np.ndarray) -> list[float] | None:
     touching = np.flatnonzero(mask)
     return [float(time[touching[0]]), float(time[touching[-1]])] if len(touching) else None
 
 
-def run_summary(run: "Run", record: Record, comparison: Comparison | None) -> dict:
+def run_summary(run: FinishedRun, record: Record, comparison: Comparison | None) -> dict:
     """What summary.json says of a run, with None for the discretisation error.
 
     Args:
@@ -111,12 +135,12 @@ def _motion_times(motion: Motion) -> dict[str, list]:
     return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
 
 
-def slice_areas(run: "Run") -> list[float]:
+def slice_areas(run: FinishedRun) -> list[float]:
     """Sections of a sequence's slices, m^2; empty without a sequence."""
     return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
 
 
-def add_discretization_error(run: "Run", summary: dict) -> None:
+def add_discretization_error(run: FinishedRun, summary: dict) -> None:
     """What the estimate says; None stays where the run ended early or a policy led."""
     estimate = run.station.estimate_error
     # A policy would decide otherwise on another mesh.
@@ -128,7 +152,7 @@ def add_discretization_error(run: "Run", summary: dict) -> None:
         summary["discretization_error"] = {"relative_rms": None, "problem": str(problem)}
 
 
-def _clamped(run: "Run") -> str | None:
+def _clamped(run: FinishedRun) -> str | None:
     """Says that a blade shook in a food which clamps it, and what to change; else None."""
     food = run.scenario.food
     if not (run.stopped or "").startswith(UNSTABLE_GAINS) or not isinstance(food, Food):
@@ -141,7 +165,7 @@ def _clamped(run: "Run") -> str | None:
     )
 
 
-def _not_cut_through(run: "Run", record: Record) -> str | None:
+def _not_cut_through(run: FinishedRun, record: Record) -> str | None:
     """Says that a motion's end left the food uncut, and what to change; None where it did not."""
     scenario, station = run.scenario, run.station
     # Without an estimate the food has no finite elements, or a robot cuts a real one.
