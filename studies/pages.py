@@ -37,6 +37,11 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.2g} %" if abs(share) < 0.1 else f"{100.0 * share:.0f} %"
 
 
+def _formatted(value: object, form: str) -> str:
+    """A value as `format` writes it; of one that is missing the name is said."""
+    return format(str(value) if isinstance(value, StrictUndefined) else value, form)
+
+
 def _environment() -> Environment:
     """Where templates are; they know `table`, `| percent`, and `| f(".2f")` for other numbers."""
     environment = Environment(
@@ -47,7 +52,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.globals["table"] = table
-    environment.filters |= {"f": format, "percent": percent}
+    environment.filters |= {"f": _formatted, "percent": percent}
     return environment
 
 

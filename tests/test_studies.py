@@ -83,7 +83,7 @@ def test_tables_stand_in_no_other_module():
 
 
 def test_a_page_without_one_of_its_values_is_refused(tmp_path):
-    with pytest.raises(Exception, match="'command' is undefined"):
+    with pytest.raises(Exception, match="'slope' is undefined"):
         render("endurance")
     publish("text", tmp_path / "a" / "page.md", {"values": np.array([1.0, 2.0 / 3.0])})
     results = json.loads((tmp_path / "a" / "page.json").read_text(encoding="utf-8"))
