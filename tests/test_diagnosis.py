@@ -202,6 +202,18 @@ def test_where_the_law_is_wrong_what_is_locked_to_depth_has_to_gain_most(wrong, 
     assert verdict.names == names
 
 
+@pytest.mark.parametrize(("elsewhere", "name"), [(0.3, "whole"), (0.1, "local")])
+def test_no_cause_is_named_for_a_part_of_what_one_with_more_evidence_does(elsewhere, name):
+    """What acts everywhere is small in the mean of its rows; where it acts most, another cause can
+    do the same. It is named in that one's place unless it is far too small."""
+    everywhere = bump(1.0) + elsewhere * np.sin(40.0 * np.pi * TIME)
+    verdict = reach_verdict(two_causes(0.0, 0.3, everywhere, ("local", "whole")), 60)
+    whole, local = verdict.screening.causes[:2]
+    assert whole.name == "whole" and whole.gain > 2.0 * local.gain
+    assert whole.size < DecisionRule.size < local.size
+    assert verdict.names == [[name]]
+
+
 def test_a_number_that_the_own_error_may_stand_for_is_seen_once_the_others_are_in_the_model():
     """One does much and the other little, both in shapes that the simulation may be wrong by."""
     shapes = two_causes(0.0, 0.0, bump(1.3)).shape_values[0]

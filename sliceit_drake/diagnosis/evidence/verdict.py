@@ -78,6 +78,8 @@ class DecisionRule:
             causes of up to this size.
         size_by_record: The same of an effect that differs from record to record, over the noise
             alone: no own error does that.
+        size_instead: The same of an effect in whose place another would be named, of less evidence
+            and with nothing to gain beside it.
         size_known: The same where the food's file knows what the simulation gets wrong, and of what
             every sensor has a little of, as a delay, which has to gain beyond that.
         limit: Level of the intervals of the causes' numbers.
@@ -98,6 +100,7 @@ class DecisionRule:
     left: float = 0.05
     size: float = 0.9
     size_by_record: float = 0.5
+    size_instead: float = 0.5
     size_known: float = 0.7
     limit: float = 0.1
     replicates: int = 3
@@ -252,11 +255,24 @@ def reach_verdict(
                 why = f"gains no more than chance gives{beside_it}"
                 refused = dict.fromkeys((e.name for e in screening.causes), why) | refused
             break
+        # What has more evidence than one that is named, and would be named but for its size.
+        smaller: list[CauseEvidence] = []
         for e in sorted(screening.causes, key=lambda e: -e.gain):
             why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
             if not why and e.name not in refuted:
+                for other in smaller:
+                    also = [*assumed, other.cause]
+                    beside = screen(problem, replicates, seed + len(findings), also, progress)
+                    if _refusal(problem, beside, beside.evidence(e.name), rule):
+                        e = other
+                        del refused[e.name]
+                        break
                 findings.append(Finding(e, e.size, e.share, _others(problem, screening, e)))
                 break
+            if e.size < rule.least_size(problem, e) and e.name not in refuted:
+                instead = dc.replace(rule, size=rule.size_instead)
+                if not (_refusal(problem, screening, e, instead) or _beside(e, assumed)):
+                    smaller.append(e)
             refused[e.name] = f"{why or refuted[e.name]}{beside_it}"
             if not why or why == _at_bound(e):
                 aside.append(e)
