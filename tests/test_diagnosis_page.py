@@ -18,6 +18,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("explanation/diagnosis", f"The alarm of {100 * RULE.alarm:g} %"),
         ("explanation/diagnosis", f"is at least {RULE.size:g} of noise and own error together"),
         ("explanation/diagnosis", f"A delay has to be {RULE.size_known:g}"),
+        ("explanation/diagnosis", f"An effect of {RULE.size_instead:g} is enough where another"),
         ("explanation/diagnosis", f"gains at least {RULE.gain:g} for each record, twice"),
         ("explanation/diagnosis", f"as many times less is enough, down to {RULE.right:g}"),
         ("explanation/diagnosis", f"at least {RULE.beside:g} for each record beside others"),
