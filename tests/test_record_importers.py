@@ -506,10 +506,35 @@ def import_by_hand(folder: Path, rows: np.ndarray, capsys, *options: str) -> tup
     """Status of an import, and what it says."""
     np.savetxt(folder / "scale.csv", rows, delimiter=",")
     words = ["--shape", "cylinder", "--size", "0.027", "0.12", "0.027", *options]
-    status = main(
-        ["records", "import", "force", str(folder / "scale.csv"), "--output", str(folder), *words]
-    )
+    words += ["--output", str(folder / "records"), "--replace"]
+    status = main(["records", "import", "force", str(folder / "scale.csv"), *words])
     return status, capsys.readouterr().out
+
+
+def test_an_import_writes_over_no_measurement_and_over_no_record_unasked(tmp_path, capsys):
+    for day, scale in (("mon", 1.0), ("tue", 1.1)):
+        (tmp_path / day).mkdir()
+        rows = slice_in_air_and_food() * [1.0, scale]
+        np.savetxt(tmp_path / day / "cut1.csv", rows, delimiter=",")
+
+    def imported(day: str, output: str, *more: str) -> str:
+        words = ["--component", "vertical", "--shape", "cylinder", "--size", "0.027", "0.12"]
+        words += ["0.027", "--output", str(tmp_path / output), *more]
+        main(["records", "import", "force", str(tmp_path / day / "cut1.csv"), *words])
+        return capsys.readouterr().err
+
+    raw = (tmp_path / "mon" / "cut1.csv").read_bytes()
+    for more in ((), ("--replace",)):
+        assert "Give another --output, or --name NAME" in imported("mon", "mon", *more)
+    assert [f.read_bytes() for f in (tmp_path / "mon").iterdir()] == [raw]
+    assert imported("mon", "records") == ""
+    first = (tmp_path / "records" / "cut1.csv").read_bytes()
+    said = imported("tue", "records")
+    assert "cut1.csv: is there already. Give --name NAME to keep both, or --replace" in said
+    assert (tmp_path / "records" / "cut1.csv").read_bytes() == first
+    assert imported("tue", "records", "--name", "cut2") == ""
+    assert imported("tue", "records", "--replace") == ""
+    assert (tmp_path / "records" / "cut1.csv").read_bytes() != first
 
 
 def test_a_spike_above_all_forces_does_not_hide_the_contact(tmp_path, capsys):

@@ -54,7 +54,8 @@ Make a slice record from another format.
 
 --metadata is a YAML file with what FILE does not say: food, board, knife, nominal motion, sensor,
 provenance, and what is unknown (docs/reference/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml,
-and prints what `sliceit records check` finds in them.
+and prints what `sliceit records check` finds in them. A record that is there already is replaced
+only with --replace, and FILE never.
 """
 
 
@@ -102,6 +103,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_folder(make, "folder of records", required=True)
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
     make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")
+    make.add_argument(
+        "--replace", action="store_true", help="replace a record of that name, as after a mistake"
+    )
     pose = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
     make.add_argument(
         "--tcp-to-knife",
@@ -208,14 +212,16 @@ def _import(options: argparse.Namespace) -> int:
     from sliceit_drake.records.validation import check_record
 
     metadata = load_yaml(SliceMetadata, options.metadata)
-    metadata.name = options.name or metadata.name
+    metadata.name = options.name or metadata.name or options.file.stem
+    check_name(metadata.name, "a record", "Give --name NAME, one")
+    target = options.output / metadata.name
+    _check_target(target, options)
     if options.format == "force":
         metadata.wrench.sign = options.sign or metadata.wrench.sign
         options.component = options.component or _component(options)
         metadata = complete_facts(metadata, options)
     record = _imported(options, metadata)
-    check_name(record.name, "a record", "Give --name NAME, one")
-    file = write_record(record, options.output / record.name)
+    file = write_record(record, target)
     print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
     if options.format == "force":
         _say_what_was_taken(record)
@@ -225,7 +231,27 @@ def _import(options: argparse.Namespace) -> int:
         print(finding)
         if options.format == "force" and finding.kind in AGAIN:
             print(f"If so, import it again with {AGAIN[finding.kind]}.")
+            print("With --replace it is written over this record.")
     return 1 if any(finding.severity == "error" for finding in findings) else 0
+
+
+def _check_target(target: Path, options: argparse.Namespace) -> None:
+    """Refuses to write a record over the file that it is made of, or over another record."""
+    from sliceit_drake.records.slice_record import record_pair
+
+    for file in record_pair(target):
+        if file.resolve() == options.file.resolve():
+            raise ConfigurationError(
+                "the record would be written over FILE, the measurement itself",
+                source=str(file),
+                fix="Give another --output, or --name NAME.",
+            )
+        if file.exists() and not options.replace:
+            raise ConfigurationError(
+                "is there already",
+                source=str(file),
+                fix="Give --name NAME to keep both, or --replace to write over it.",
+            )
 
 
 def _say_what_was_taken(record: "SliceRecord") -> None:

@@ -25,6 +25,7 @@ __all__ = [
     "columns_of",
     "read_table",
     "record_from_table",
+    "record_pair",
     "sensor_rotation",
     "velocities",
     "write_record",
@@ -216,7 +217,7 @@ def columns_of(series: Mapping[tuple[str, ...], np.ndarray | None]) -> dict[str,
     return {name: column for pair in known for name, column in zip(*pair, strict=True)}
 
 
-def _files(file: str | Path) -> tuple[Path, Path]:
+def record_pair(file: str | Path) -> tuple[Path, Path]:
     """NAME.csv and NAME.yaml, of either or of NAME."""
     path = Path(file)
     base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
@@ -229,7 +230,7 @@ def read_table(file: str | Path) -> SliceTable:
     Raises:
         ConfigurationError: If a file cannot be read, a name is unknown, or a cell holds text.
     """
-    table, facts = _files(file)
+    table, facts = record_pair(file)
     if not table.is_file() and not facts.is_file():
         raise ConfigurationError(
             "there is no such record", source=str(table), fix="Check the path."
@@ -409,7 +410,7 @@ def write_record(record: SliceRecord, file: str | Path) -> Path:
     Returns:
         The CSV file.
     """
-    output, facts = _files(file)
+    output, facts = record_pair(file)
     output.parent.mkdir(parents=True, exist_ok=True)
     table = record.table()
     names = [name for name in COLUMNS if name in table.columns]
