@@ -328,6 +328,22 @@ def test_units_and_separators_of_other_labs_are_read(tmp_path, header, separator
     assert record.force_vertical[-1] == pytest.approx(known[-1, 1], abs=0.02)
 
 
+def test_the_time_of_a_clock_counts_from_the_first_row_and_no_row_is_lost(tmp_path, capsys):
+    known = slice_in_air_and_food()
+    rows = "".join(f"{1772323200.0 + t:.4f},{f:.9f}\n" for t, f in known)
+    (tmp_path / "a.csv").write_text("timestamp,force\n" + rows, encoding="utf-8")
+    command = ["records", "import", "force", str(tmp_path / "a.csv"), "--component", "vertical"]
+    command += ["--shape", "cylinder", "--size", "0.027", "0.12", "0.027", "--name", "b"]
+    assert main([*command, "--output", str(tmp_path), "--between", "0.2", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "The force begins at 0.5" in said and "times count from its first row" in said
+    record = load_record(tmp_path / "b.csv")
+    np.testing.assert_allclose(record.time, known[100:, 0], atol=1e-6)
+    assert record.metadata.processing[0].numbers["start"] == 1772323200.0
+    with pytest.raises(ConfigurationError, match="in seconds of the table after its first row"):
+        import_force(tmp_path / "a.csv", facts(), between=[1772323200.2, 1772323202.0])
+
+
 def test_components_in_the_knifes_axes_become_those_of_the_world(tmp_path):
     known = slice_in_air_and_food()
     table = np.column_stack([known[:, 0], 0.1 * known[:, 1], 0.0 * known[:, 1], -known[:, 1]])

@@ -219,3 +219,12 @@ def test_the_documentation_names_every_column_and_field():
     for name in fmt.COLUMNS:
         stem, _, axis = name.rpartition("_")
         assert name in words or (stem + "_x") in words or (stem + "_w") in words or stem == "q"
+
+
+def test_a_time_far_from_zero_is_written_to_the_microsecond(tmp_path):
+    record = example_slice()
+    record.time = record.time + 1772323200.0
+    for phase in record.metadata.motion.phases:
+        phase.start, phase.end = phase.start + 1772323200.0, phase.end + 1772323200.0
+    table = read_table(write_record(record, tmp_path / "late"))
+    np.testing.assert_allclose(table.columns["time"] - record.time, 0.0, atol=1e-6)

@@ -166,8 +166,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("S", "S"),
         nargs=2,
         type=float,
-        help="force, rosbag: begin and end of the slice, s, in the time of FILE or after the "
-        "first wrench; default: all",
+        help="force, rosbag: begin and end of the slice, s, in the time of FILE, or after the "
+        "first wrench or, of a clock's time, the first row; default: all",
     )
     make.add_argument(
         "--clock",
@@ -208,8 +208,8 @@ def _import(options: argparse.Namespace) -> int:
     """Runs `sliceit records import`."""
     from sliceit_drake.configuration import load_yaml
     from sliceit_drake.records.metadata import SliceMetadata
-    from sliceit_drake.records.slice_record import write_record
-    from sliceit_drake.records.validation import check_record
+    from sliceit_drake.records.slice_record import read_table, write_record
+    from sliceit_drake.records.validation import check_table
 
     metadata = load_yaml(SliceMetadata, options.metadata)
     metadata.name = options.name or metadata.name or options.file.stem
@@ -225,8 +225,8 @@ def _import(options: argparse.Namespace) -> int:
     print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
     if options.format == "force":
         _say_what_was_taken(record)
-    record.file = str(file)
-    findings = check_record(record)
+    # As they were written, for that is what all else will read.
+    findings = check_table(read_table(file))
     for finding in findings:
         print(finding)
         if options.format == "force" and finding.kind in AGAIN:
@@ -287,6 +287,8 @@ def _say_what_was_taken(record: "SliceRecord") -> None:
             f"{spikes} row{'s' * (spikes > 1)} far from those before and after, as of a faulty "
             "cable: the fit hardly counts such."
         )
+    if "start" in facts.processing[0].numbers:
+        print("The table has the time of a clock: times count from its first row.")
     if any(step.name == "tare" for step in facts.processing):
         print("The mean force before that is taken off.")
     if facts.unknown:

@@ -19,6 +19,8 @@ UNITS = SECONDS | NEWTONS
 """Units of time and force by name, in small letters: s and N."""
 SLOWEST = 0.25
 """Rows further apart than this, s, are in another unit: a slice lasts a second or a few."""
+LONG_AGO = 1e6
+"""A table whose first time is later than this, s, has that of a clock, such as Unix time."""
 EARLY = 10
 """Rows at least that tell whether a record begins in the air, where the force is level."""
 ONSET = 0.02
@@ -43,11 +45,14 @@ class ForceTable:
         time: [n], s.
         force: [n, 1], or [n, 3] of three components, N.
         units: Of time and force in the file, where the file or the caller says them.
+        start: Time in the file that is 0 here, s: of the first row where the file has the time of
+            a clock.
     """
 
     time: np.ndarray
     force: np.ndarray
     units: tuple[str | None, str | None]
+    start: float = 0.0
 
 
 def read_force_table(
@@ -56,7 +61,8 @@ def read_force_table(
     """Reads time and force from a table with a comma, semicolon, tab or spaces between its cells.
 
     Rows before the first of numbers are a header. A decimal comma is understood beside any other
-    separator. Units in brackets in the header, or in a row of units, are converted.
+    separator. Units in brackets in the header, or in a row of units, are converted. Where the time
+    is that of a clock, such as Unix time, it is counted from the first row.
 
     Args:
         columns: Names or numbers (from 1) of the time and of one or three columns of the force; by
@@ -89,6 +95,8 @@ def read_force_table(
             )
     values = np.array([_numbers(file, row, names, picked) for row in rows[first:]])
     time = values[:, 0] * SECONDS[(known[0] or "s").lower()]
+    start = float(time[0]) if time[0] > LONG_AGO else 0.0
+    time = time - start
     require_increasing(time, file, names[picked[0]])
     period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if known[0] is None and period > SLOWEST:
@@ -98,9 +106,8 @@ def read_force_table(
             field=names[picked[0]],
             fix="Is it in ms? Give --units ms N; give --units s N if it is in seconds.",
         )
-    return ForceTable(
-        time, values[:, 1:] * NEWTONS[(known[1] or "N").lower()], (known[0], known[1])
-    )
+    force = values[:, 1:] * NEWTONS[(known[1] or "N").lower()]
+    return ForceTable(time, force, (known[0], known[1]), start)
 
 
 def find_contact(time: np.ndarray, force: np.ndarray, file: str = "") -> float | None:

@@ -172,7 +172,8 @@ def import_force(
             `wrench.frame`.
         contact: Time at which the force rises, s, which ends the air phase; None to take the
             phases of `metadata`, or without these to find it.
-        columns, units: See `read_force_table`.
+        columns, units: See `read_force_table`, which also says when times count from the first row:
+            `contact`, `between` and the phases of `metadata` then do too.
         between: First and last time of the slice in the file, s.
 
     Raises:
@@ -204,7 +205,8 @@ def import_force(
             f"{table.time[0]:g} to {table.time[-1]:g} s",
             source=str(file),
             field="--between",
-            fix="Give first and last time of the slice, in seconds of the table.",
+            fix="Give first and last time of the slice, in seconds of the table"
+            + (" after its first row." if table.start else "."),
         )
     # The component that changes most, with its sign.
     most = force[:, np.ptp(force, axis=0).argmax()]
@@ -222,6 +224,8 @@ def import_force(
     step = ProcessingStep("import_force", {}, "the motion is nominal")
     if None in table.units:
         step.note += "; the table names no unit of time or of force: s and N are taken"
+    if table.start:
+        step.numbers["start"] = table.start
     if component == "norm":
         return _nominal_record(file, facts, step, time, {"force_norm": force[:, 0]}, contact)
     if component == "vertical":

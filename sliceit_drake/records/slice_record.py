@@ -414,10 +414,13 @@ def write_record(record: SliceRecord, file: str | Path) -> Path:
     output.parent.mkdir(parents=True, exist_ok=True)
     table = record.table()
     names = [name for name in COLUMNS if name in table.columns]
+    # Where the time is that of a clock, its steps are far smaller than itself.
+    late = np.abs(record.time).max() / max(np.ptp(record.time), 1e-9)
+    digits = min(16, 10 + int(np.ceil(np.log10(max(late, 1.0)))))
     np.savetxt(
         output,
         np.column_stack([table.columns[name] for name in names]),
-        fmt="%.10g",
+        fmt=[f"%.{digits if name == TIME else 10}g" for name in names],
         delimiter=",",
         header=",".join(names),
         comments="",
