@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import load_setup
+from sliceit_drake.cli import records as records_command
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.records.force_profile import load_force_profile
@@ -502,6 +503,9 @@ def test_the_program_imports_a_recording_and_says_what_is_wrong(tmp_path, capsys
     arguments += ["--metadata", str(tmp_path / "facts.yaml"), "--output", str(tmp_path / "out")]
     assert main(arguments) == 2
     assert "--tcp-to-knife: is not given. Give the pose of the knife" in capsys.readouterr().err
+    degrees = [*pose[:3], "180", "0", "0"]
+    assert main([*arguments, "--tcp-to-knife", *degrees]) == 2
+    assert "--tcp-to-knife: 180 0 0 is more than a turn. Give ROLL" in capsys.readouterr().err
     base = ["0.5", "-0.4", "0.02", "0", "0", "2.1"]
     arguments += ["--tcp-to-knife", *pose, "--world-to-base", *base, "--name", "flipped"]
     assert main(arguments) == 1
@@ -516,6 +520,14 @@ def test_the_program_imports_a_recording_and_says_what_is_wrong(tmp_path, capsys
     assert f"{tmp_path / 'out' / 'right.csv'}: nothing found" in out
     assert "2 records, 1 with errors" in out
     assert main(["records", "check", str(tmp_path / "out" / "right.csv")]) == 0
+
+
+def test_the_pose_that_the_help_gives_brings_the_edge_down(tmp_path, capsys):
+    """With a tool whose z points down, as a UR5e's over its board."""
+    (words,) = set(re.findall(r"--tcp-to-knife ((?:\S+ ){5}\S+)", records_command.IMPORT))
+    X_TK = pose_matrix([float(x) for x in words.split()[:3]], [float(x) for x in words.split()[3:]])
+    record = import_ur_rtde(RECORDING, SliceMetadata(), X_TK)
+    assert (record.rotation[:, 2, 2] < -0.99).all()
 
 
 def import_by_hand(folder: Path, rows: np.ndarray, capsys, *options: str) -> tuple[int, str]:

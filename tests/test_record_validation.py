@@ -217,6 +217,12 @@ def turned(table: SliceTable) -> None:
         table.columns[name][900:] = column
 
 
+def upside_down(table: SliceTable) -> None:
+    """As a tool that is turned by pi once more than it was."""
+    for name, values in zip(fmt.QUATERNION, (1.0, 0.0, 0.0, 0.0), strict=True):
+        table.columns[name] = np.full(len(table.lines), values)
+
+
 def scalar_last(table: SliceTable) -> None:
     table.columns["quat_WK_w"] = table.columns["quat_WK_w"] + 0.3
 
@@ -326,6 +332,7 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (phase_beside, "warning", "phases", "phases.4.: other from 7 to 8 s is beside the record"),
         (jump, "error", "jump", "lines 801 to 802: p_WK_x: the pose jumps: 5 m/s between two"),
         (turned, "error", "jump", "lines 901 to 902: quat_WK_w: the pose jumps: 100 rad/s"),
+        (upside_down, "error", "upside down", "lines 252 to 926: quat_WK_w: .*--tcp-to-knife"),
         (scalar_last, "error", "quaternion", "lines 2 to 1501: quat_WK_w: .*length 1.04.*w first"),
         (dropout, "warning", "dropout", "lines 1001 to 1002: time: 0.102 s without a row, where"),
         (velocity_of_another_axis, "warning", "velocity", "v_WK_x: the velocities add up to a"),

@@ -3,6 +3,7 @@ docs/reference/records.md describes the format; calibration/records holds three 
 """
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +37,7 @@ Make a slice record from another format.
   ur_rtde   a recording of ur_rtde's RTDEReceiveInterface.startFileRecording, with at least the
             variables timestamp, actual_TCP_pose, actual_TCP_speed, actual_TCP_force (and actual_q):
               sliceit records import ur_rtde run_07.csv --metadata session.yaml \\
-                --tcp-to-knife 0 0 0.12 3.1416 0 0 --output records
+                --tcp-to-knife 0 0 0.12 0 0 0 --output records
   force     time and force of any lab, with a comma, semicolon, tab or spaces between; the motion
             is nominal, straight down at motion.speed. At a terminal the command asks for what the
             table does not say; in a script options or a YAML file say it:
@@ -49,7 +50,7 @@ Make a slice record from another format.
   rosbag    a ROS 1 .bag, a ROS 2 folder, .db3 or .mcap: --topics names one of WrenchStamped, and
             one of PoseStamped, TransformStamped or (a UR5e's) JointState; no ROS is needed:
               sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose \\
-                --tcp-to-knife 0 0 0.12 3.1416 0 0 --between 4.0 9.5 --metadata session.yaml \\
+                --tcp-to-knife 0 0 0.12 0 0 0 --between 4.0 9.5 --metadata session.yaml \\
                 --output records
 
 --metadata is a YAML file with what FILE does not say: food, board, knife, nominal motion, sensor,
@@ -337,6 +338,13 @@ def _imported(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceR
         )
 
     tcp, base = options.tcp_to_knife, options.world_to_base or [0.0] * 6
+    for option, pose in (("--tcp-to-knife", tcp), ("--world-to-base", base)):
+        if any(abs(angle) > 2.0 * math.pi for angle in pose[3:]):
+            raise ConfigurationError(
+                f"{' '.join(f'{angle:g}' for angle in pose[3:])} is more than a turn",
+                field=option,
+                fix="Give ROLL PITCH YAW in rad: 180 degrees are 3.1416.",
+            )
     X_TK = importers.pose_matrix(tcp[:3], tcp[3:])
     X_WB = importers.pose_matrix(base[:3], base[3:])
     if options.format == "ur_rtde":

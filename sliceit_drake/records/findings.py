@@ -33,6 +33,10 @@ KINDS = {
         "warning",
         "Give velocities of Ko in W, or remove the columns: they are then derived.",
     ),
+    "upside down": (
+        "error",
+        "Check --tcp-to-knife (rad; z of K points from the spine to the edge), or correct quat_WK.",
+    ),
     "below board": ("warning", "Correct board_height, or the knife's pose on the tool."),
     "constant": ("error", "Record the sensor, not its command."),
     "negative norm": ("error", "Give the components force_x..z, or the norm."),

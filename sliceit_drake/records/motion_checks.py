@@ -1,4 +1,4 @@
-"""Checks of the motion in a slice record: units, jumps, gaps in time, velocities, board."""
+"""Checks of the motion in a slice record: units, jumps, gaps, velocities, board, edge down."""
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -33,6 +33,7 @@ def check_motion(table: SliceTable, record: SliceRecord, findings: Findings) -> 
     _check_jumps(record, findings)
     _check_sampling(record, findings)
     _check_velocities(table, record, findings)
+    _check_upright(record, findings)
     board = record.metadata.board_height
     if board is not None and "p_WK_z" not in record.metadata.unknown:
         low = record.position[:, 2] < board - BELOW_BOARD
@@ -97,6 +98,17 @@ def _check_jumps(record: SliceRecord, findings: Findings) -> None:
             text = f"the pose jumps: {values[k]:.3g} {unit} between two rows, expected at most"
             text += f" {limit:g} {unit} ({int((values > limit).sum())} such steps)"
             findings.add("jump", name, text, (k, k + 1))
+
+
+def _check_upright(record: SliceRecord, findings: Findings) -> None:
+    """A knife whose edge points up in most rows of the slice is placed wrongly on the tool."""
+    cut = record.phase("slice", "second_pass")
+    if not record.metadata.motion.phases:
+        cut = np.ones(len(record), bool)
+    up = np.flatnonzero(cut & (record.rotation[:, 2, 2] >= 0.0))
+    if 2 * len(up) > cut.sum():
+        text = "the knife is upside down: z of K does not point down while slicing"
+        findings.add("upside down", fmt.QUATERNION[0], text, (int(up[0]), int(up[-1])))
 
 
 def _check_sampling(record: SliceRecord, findings: Findings) -> None:
