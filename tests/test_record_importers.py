@@ -15,6 +15,7 @@ from sliceit_drake.cli import records as records_command
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.records.force_table import read_force_table
 from sliceit_drake.records.importers import (
     import_force,
     import_frame,
@@ -269,6 +270,7 @@ def test_a_vertical_force_is_tared_by_the_mean_in_the_air(tmp_path):
         ("t,f\n1,1\n0,1\n", {}, "scale.csv: t: row 2 has 0 after 1. Sort the rows"),
         ("t,f\n0,1\n5,1\n", {}, "t: its rows are 5 s apart.* Is it in ms. Give --units ms N"),
         ("t (ms),f [stone]\n0,1\n", {"units": ["ms", "stone"]}, "'stone' is no unit of force"),
+        ("t [s],U [mV]\n0,1\n", {}, r"scale.csv: U \[mV\]: 'mV' is no known unit of force"),
         (CURVE, {"size": None}, "food.size: is not given, but the motion of"),
         (CURVE, {"contact": 3.0}, "contact: 3 s is not within the record, 0 to 1.8 s"),
         (CURVE, {"component": "sideways"}, "component: 'sideways' is no component"),
@@ -327,6 +329,25 @@ def test_units_and_separators_of_other_labs_are_read(tmp_path, header, separator
     record = import_force(tmp_path / "a.csv", facts(), component="vertical")
     np.testing.assert_allclose(record.time, known[:, 0], atol=1e-9)
     assert record.force_vertical[-1] == pytest.approx(known[-1, 1], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("header", "unit", "newtons"),
+    [
+        ("Time (s),Load (lbs)", "lbs", 4.4482216),
+        ("Time (s),Load (cN)", "cN", 0.01),
+        ("t / seconds,F(t) / daN", "daN", 10.0),
+        ("Time [s],Force [Newton]", "Newton", 1.0),
+        ("t_s,F_min", None, 1.0),
+        ("t_s,F_s", None, 1.0),
+        ("Time,Force (filtered)\ns,N", "N", 1.0),
+    ],
+)
+def test_a_unit_of_force_in_the_header_is_taken_or_there_is_none(tmp_path, header, unit, newtons):
+    (tmp_path / "a.csv").write_text(f"{header}\n0,1\n0.01,2\n", encoding="utf-8")
+    table = read_force_table(tmp_path / "a.csv")
+    assert table.units[1] == unit
+    np.testing.assert_allclose(table.force[:, 0], [newtons, 2.0 * newtons])
 
 
 def test_the_time_of_a_clock_counts_from_the_first_row_and_no_row_is_lost(tmp_path, capsys):

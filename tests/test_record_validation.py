@@ -89,6 +89,10 @@ def kilonewtons_without_size(table: SliceTable) -> None:
     table.metadata.unknown.append("food.size")
 
 
+def grams(table: SliceTable) -> None:
+    scale(table, fmt.FORCE, 1.0 / 9.80665e-3)
+
+
 def counts(table: SliceTable) -> None:
     scale(table, fmt.FORCE, 1e3)
 
@@ -296,6 +300,12 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (hard_in_kilonewtons, "error", "kilonewtons", "its noise in the air is 0.0003 N"),
         (kilonewtons_without_air, "error", "kilonewtons", "J per m2 of cut, expected at least 1 J"),
         (kilonewtons_without_size, "error", "kilonewtons", "0.1 N. Is it in kN. Multiply"),
+        (
+            grams,
+            "warning",
+            "great work",
+            "J per m2 of cut, .* at most 20000 J/m2. Is the force in g",
+        ),
         (counts, "error", "force unit", "line .*: the force reaches .*e.04 N. Is it in mN"),
         (millimetres, "error", "millimetres", "line .*: p_WK_x: 4.* Is it in mm. Divide"),
         (

@@ -64,6 +64,7 @@ AGAIN = {
     "flipped sign": "--sign by_knife",
     "kilonewtons": "--units s kN",
     "force unit": "--units s mN",
+    "great work": "--units s g",
     "negative norm": "--component vertical (and --sign by_knife if a press is negative)",
     "level end": "--between START END",
 }

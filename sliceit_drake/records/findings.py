@@ -50,6 +50,10 @@ KINDS = {
         "Let the sensor warm up, record air before and after the slice, and repeat it.",
     ),
     "force unit": ("error", "Is it in mN, or in counts of the sensor? Convert it to newtons."),
+    "great work": (
+        "warning",
+        "Is the force in g, or in counts of the sensor? Convert it to newtons.",
+    ),
     "kilonewtons": (
         "error",
         "Is it in kN? Multiply the force and torque columns by 1000 to give N and Nm.",

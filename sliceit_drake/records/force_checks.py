@@ -19,6 +19,8 @@ WEAK_FORCE = 1.0
 """Below this the noise is looked at, N."""
 MIN_WORK = 1.0
 """Work over cut area below this, J/m2, is less than the toughness of any food, soft gels too."""
+MOST_WORK = 2e4
+"""Work over cut area above this, J/m2, is several times that of a carrot with all its friction."""
 GREATEST_FORCE = 5000.0
 """A force above this, N, breaks any arm that holds a kitchen knife."""
 FROZEN_TIME = 0.2
@@ -147,6 +149,9 @@ def _check_units(
         if work < MIN_WORK * area:
             problem = f"the work of slicing is {work / area:.2g} J per m2 of cut, expected at least"
             problem += f" {MIN_WORK:g} J/m2"
+        elif work > MOST_WORK * area:
+            text = f"the work of slicing is {work / area:.2g} J per m2 of cut, expected at most"
+            findings.add("great work", name, f"{text} {MOST_WORK:g} J/m2", _ends(cut))
     if problem:
         findings.add("kilonewtons", name, problem, _ends(cut))
 

@@ -13,8 +13,10 @@ from sliceit_drake.tables import finite_number, require_increasing
 __all__ = ["UNITS", "ForceTable", "find_contact", "one_slice", "read_force_table"]
 
 SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
-NEWTONS = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "g": 9.80665e-3, "gf": 9.80665e-3}
-NEWTONS |= {"kg": 9.80665, "kgf": 9.80665, "lbf": 4.4482216}
+SECONDS |= dict.fromkeys(("second", "seconds"), 1.0) | dict.fromkeys(("µs", "μs"), 1e-6)
+NEWTONS = {"n": 1.0, "newton": 1.0, "newtons": 1.0, "kn": 1e3, "dan": 10.0, "cn": 1e-2, "mn": 1e-3}
+NEWTONS |= dict.fromkeys(("g", "gf"), 9.80665e-3) | dict.fromkeys(("kg", "kgf", "kp"), 9.80665)
+NEWTONS |= dict.fromkeys(("lbf", "lbs", "lb"), 4.4482216)
 UNITS = SECONDS | NEWTONS
 """Units of time and force by name, in small letters: s and N."""
 SLOWEST = 0.25
@@ -84,12 +86,14 @@ def read_force_table(
     header = [cells for _, cells in rows[:first] if len(cells) == width]
     names = header[0] if header else [str(k + 1) for k in range(width)]
     picked = _picked(file, names, columns)
-    known = [_unit_of(header, k) for k in (picked[0], picked[1])]
-    known = [given or found for given, found in zip(units or (None, None), known, strict=True)]
-    for unit, table in zip(known, (SECONDS, NEWTONS), strict=True):
+    tables = (SECONDS, NEWTONS)
+    known: list[str | None] = list(units)
+    if not units:
+        known = [_unit_of(file, header, *pair) for pair in zip(picked[:2], tables, strict=True)]
+    for unit, table in zip(known, tables, strict=True):
         if unit is not None and unit.lower() not in table:
             raise ConfigurationError(
-                f"{unit!r} is no unit of {'time' if table is SECONDS else 'force'}",
+                f"{unit!r} is no unit of {_what(table)}",
                 field="--units",
                 fix=f"There are {', '.join(table)}.",
             )
@@ -239,11 +243,35 @@ def _picked(file: str | Path, names: list[str], columns: Sequence[str]) -> list[
     return out
 
 
-def _unit_of(header: list[list[str]], column: int) -> str | None:
-    """A unit in brackets or after an underscore behind the name, or a row of units below it."""
+def _what(table: dict[str, float]) -> str:
+    """What a table of units is of."""
+    return "time" if table is SECONDS else "force"
+
+
+def _unit_of(
+    file: str | Path, header: list[list[str]], column: int, table: dict[str, float]
+) -> str | None:
+    """A unit in brackets, or after an underscore or slash, or in a row of units below the names.
+
+    Raises:
+        ConfigurationError: Brackets hold something else, which may be a unit.
+    """
+    unknown = None
     for cells in header:
-        found = re.search(r"[\[(_]\s*([A-Za-z]+)\s*[\])]?$", cells[column])
-        text = found[1] if found else cells[column]
-        if text.lower() in UNITS and (found or cells is not header[0]):
-            return text
-    return None
+        bracketed = re.findall(r"[\[(]\s*([^\[\]()]+?)\s*[\])]", cells[column])
+        behind = re.findall(r"[_/]\s*([^\W_]+)$", cells[column])
+        alone = [cells[column]] if cells is not header[0] else []
+        for text in (*bracketed, *behind, *alone):
+            if text.lower() in table:
+                return text
+        if bracketed and unknown is None:
+            unknown = bracketed[-1], cells[column]
+    if unknown is None:
+        return None
+    raise ConfigurationError(
+        f"{unknown[0]!r} is no known unit of {_what(table)}",
+        source=str(file),
+        field=unknown[1],
+        fix=f"There are {', '.join(table)}. Convert the column, or say by --units TIME FORCE, as "
+        "--units s N, what it holds.",
+    )
