@@ -23,6 +23,12 @@ def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
         with open(file, newline="", encoding="utf-8") as stream:
             rows = enumerate(csv.reader(stream), start=1)
             return [(number, [cell.strip() for cell in row]) for number, row in rows if row]
+    except csv.Error as error:
+        raise ConfigurationError(
+            f"the table cannot be read ({error})",
+            source=str(file),
+            fix="Is there a quotation mark too many, or none of a pair? Remove it.",
+        ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
             f"the table cannot be read ({error})", source=str(file), fix="Check the path."

@@ -463,6 +463,25 @@ def test_at_a_terminal_one_question_comes_after_the_other(tmp_path, capsys, monk
     assert metadata.provenance == "my kitchen" and metadata.motion.speed == 0.02
 
 
+@pytest.mark.parametrize(("answers", "option"), [([], "component"), (["norm", "radish"], "shape")])
+def test_input_that_ends_at_a_question_names_its_option(
+    tmp_path, capsys, monkeypatch, answers, option
+):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
+    left = list(answers)
+
+    def answer(_: str) -> str:
+        if not left:
+            raise EOFError
+        return left.pop(0)
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", answer)
+    command = ["records", "import", "force", str(tmp_path / "a.csv"), "--output", str(tmp_path)]
+    assert main([*command, "--name", "b"]) == 2
+    assert f"--{option}: is not given: the input ended. Answer, or" in capsys.readouterr().err
+
+
 class Column:
     """As much of a pandas Series as the importer needs."""
 

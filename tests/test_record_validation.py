@@ -386,6 +386,18 @@ def test_a_record_with_an_error_is_not_loaded_and_the_message_names_its_file(tmp
         load_record(file)
 
 
+def test_a_record_that_cannot_be_split_into_cells_does_not_hide_the_next(tmp_path, capsys):
+    for name in ("a", "b"):
+        write_record(example_slice(), tmp_path / name)
+    rows = (tmp_path / "a.csv").read_text(encoding="utf-8").split("\n")
+    rows[2] = '"' + rows[2]
+    (tmp_path / "a.csv").write_text("\n".join(rows), encoding="utf-8")
+    assert main(["records", "check", str(tmp_path)]) == 1
+    said = capsys.readouterr().out
+    assert "a.csv: the table cannot be read (field larger" in said and "quotation mark" in said
+    assert "b.csv: nothing found" in said and "2 records, 1 with errors" in said
+
+
 def test_a_coarse_sensor_may_feel_nothing_in_the_air(tmp_path):
     record = example_slice()
     record.force = np.zeros_like(record.force)

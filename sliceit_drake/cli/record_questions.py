@@ -12,7 +12,7 @@ from sliceit_drake.configuration import ConfigurationError
 if TYPE_CHECKING:
     from sliceit_drake.records.metadata import SliceMetadata
 
-__all__ = ["add_question_options", "complete_facts"]
+__all__ = ["add_question_options", "asked", "complete_facts"]
 
 UNKNOWN = "unknown"
 
@@ -105,6 +105,21 @@ def complete_facts(metadata: "SliceMetadata", options: argparse.Namespace) -> "S
     return metadata
 
 
+def asked(text: str, option: str) -> str:
+    """The answer at the terminal, for which an option could stand.
+
+    Raises:
+        ConfigurationError: The input ends, as by Ctrl-D.
+    """
+    try:
+        return input(text).strip()
+    except EOFError:
+        print()
+        raise ConfigurationError(
+            "is not given: the input ended", field=f"--{option}", fix="Answer, or give the option."
+        ) from None
+
+
 def _is_open(metadata: "SliceMetadata", question: _Question) -> bool:
     value = operator.attrgetter(question.field)(metadata)
     return value in (None, "", UNKNOWN) and question.field not in metadata.unknown
@@ -114,7 +129,8 @@ def _ask(metadata: "SliceMetadata", question: _Question) -> "SliceMetadata":
     """Asks until the answer can be used; Enter alone says that it is not known."""
     while True:
         hint = "" if question.needed else " (Enter: not known)"
-        answer = input(f"{question.text[0].upper()}{question.text[1:]}{hint}: ").strip()
+        text = f"{question.text[0].upper()}{question.text[1:]}{hint}: "
+        answer = asked(text, question.option)
         if not answer and question.needed:
             continue
         try:

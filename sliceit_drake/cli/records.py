@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import add_output_folder, check_name
 from sliceit_drake.cli.extras import needs_extra
-from sliceit_drake.cli.record_questions import add_question_options, complete_facts
+from sliceit_drake.cli.record_questions import add_question_options, asked, complete_facts
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
 
@@ -305,7 +305,8 @@ def _component(options: argparse.Namespace) -> str:
         return "norm"
     while True:
         words = "norm, vertical or components"
-        answer = input(f"What of the force the file has, {words} (Enter: norm): ").strip()
+        text = f"What of the force the file has, {words} (Enter: norm): "
+        answer = asked(text, "component")
         if not answer or answer in words.replace(" or", ",").split(", "):
             return answer or "norm"
 
