@@ -208,7 +208,7 @@ def test_what_was_so_at_the_calibration_is_not_named_again(cache, tmp_path):
 def test_a_calibration_adds_what_it_gets_wrong_to_the_file_or_says_why_not(tmp_path, capsys):
     dump_yaml(CalibratedFood(food=PROTOCOL.food, knife=PROTOCOL.knife), tmp_path / "food.yaml")
     records = cut(61, "skin:2.0", slices=2)
-    options = argparse.Namespace(output=tmp_path, workers=1)
+    options = argparse.Namespace(output=tmp_path, workers=1, other_food=False)
     learn = calibrate._learn_known_error
     learn([record.rows(np.arange(19) * 20) for record in records], options)
     assert "What the simulation gets wrong is not in food.yaml: " in capsys.readouterr().out

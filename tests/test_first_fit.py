@@ -4,12 +4,13 @@ import copy
 
 import numpy as np
 import pytest
+from example_slices import example_slice
 from test_calibration import bench_records, coarse_setup
 
 from sliceit_drake.calibration import first_fit as module
 from sliceit_drake.calibration.first_fit import first_fit
 from sliceit_drake.cli.main import main
-from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.records.slice_record import write_record
 
@@ -77,3 +78,30 @@ def test_a_calibration_goes_on_without_a_first_fit(tmp_path, monkeypatch, capsys
     assert main(words) == 0
     assert "No first fit: it breaks down" in capsys.readouterr().out
     assert (tmp_path / "out/food.yaml").exists() and not (tmp_path / "out/first_fit.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a", "a"], "a.csv: force: holds the same measurement as a.csv. Remove one"),
+        (["a", "b"], "the records are of different foods: 1 of radish, 1 of potato"),
+        (["a", "--food", "potato"], "the records are of radish, the setup is of potato. Give a"),
+        (["a", "--food", "potato", "--other-food"], "fitted"),
+        (["a"], "fitted"),
+    ],
+)
+def test_records_that_do_not_belong_together_are_refused_before_the_first_fit(
+    tmp_path, monkeypatch, capsys, words, message
+):
+    def fits(*given, **named):
+        raise ConfigurationError("fitted")
+
+    monkeypatch.setattr(module, "first_fit", fits)
+    monkeypatch.chdir(tmp_path)
+    for seed, (name, food) in enumerate((("a", "radish"), ("b", "potato"))):
+        record = example_slice(seed=seed)
+        record.metadata.name, record.metadata.food.name = name, food
+        write_record(record, tmp_path / name)
+    words = [f"{word}.csv" if word in "ab" else word for word in words]
+    assert main(["calibrate", *words, "--output", "out"]) == 2
+    assert message in capsys.readouterr().err

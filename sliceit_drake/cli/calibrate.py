@@ -67,6 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a setup by name, or a YAML file of one (default: what the first record says)",
     )
+    parser.add_argument(
+        "--other-food",
+        action="store_true",
+        help="records of a food of another name than the setup's are meant",
+    )
     add_output_folder(parser, "where the results go")
     parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
     parser.add_argument(
@@ -194,14 +199,18 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.calibration.storage import open_storage, without_password
     from sliceit_drake.calibration.structure import choice_in, puncture_lines
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+    from sliceit_drake.prediction.record_set import check_foods, check_same_slice
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = None if options.food is None else load_setup(options.food)
     records = [load_record(file) for path in options.records for file in record_files(path)]
+    if not records:
+        raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
     if setup is None:
-        if not records:
-            raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
         setup = setup_of_record(records[0])
+    check_same_slice(records)
+    fix = "Give a setup of {} by --food, or leave --food out"
+    check_foods(records, setup.food.name, "setup", fix, options.other_food)
     for record in records:
         for finding in check_record(record):
             print(finding)
@@ -302,6 +311,7 @@ def _learn_known_error(records: "Sequence[SliceRecord]", options: argparse.Names
                 records,
                 workers=options.workers,
                 progress=bars.show,
+                other_food=options.other_food,
             )
     except (ConfigurationError, CuttingError) as error:
         print(f"What the simulation gets wrong is not in food.yaml: {error}")

@@ -7,7 +7,6 @@ cannot be used is an error with file, field and fix; what a reader must know is 
 
 import dataclasses as dc
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -17,6 +16,7 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.shapes import PlainShape
 from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.prediction.placement import is_bare
+from sliceit_drake.prediction.record_set import check_foods, check_same_slice, facts_file
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record
 
@@ -45,7 +45,6 @@ LONG_GAP = 6.0
 """Rows from which on a gap is reported as one."""
 SAME_SPEED, SAME_DRAW = 0.1, 0.1
 """Differences that cuts of one condition may have, relative and absolute."""
-UNNAMED = ("", "unknown")
 OBVIOUS = ("missing fact", "phases", "unknown name")
 """Warnings on facts that a diagnosis does not ask for; `sliceit records check` has them."""
 
@@ -66,8 +65,10 @@ def check_records(
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    _check_same_slice(records)
-    _check_foods(records, food, other_food)
+    check_same_slice(records)
+    fix = "Give the model of that food (--model {}; sliceit calibrate makes one)"
+    check_foods(records, food.name, "model", fix, other_food)
+    _check_phases(records)
     _check_channels(records)
     for record in records:
         _check_force(record)
@@ -102,73 +103,14 @@ def _torques(records: Sequence[SliceRecord]) -> str:
     )
 
 
-def _facts_file(record: SliceRecord) -> str:
-    return str(Path(record.source).with_suffix(".yaml"))
-
-
-def _check_same_slice(records: Sequence[SliceRecord]) -> None:
-    """The same file twice looks like a slice that repeats itself without any noise."""
-    seen: dict[bytes, SliceRecord] = {}
-    names: dict[str, SliceRecord] = {}
-    for record in records:
-        force = record.measured_force
-        content = (record.time - record.time[0]).round(9).tobytes() + force.tobytes()
-        if content in seen:
-            raise ConfigurationError(
-                f"holds the same measurement as {seen[content].source}",
-                source=record.source,
-                field="force",
-                fix="Remove one: a slice counted twice would look like two that agree.",
-            )
-        if record.name in names:
-            raise ConfigurationError(
-                f"is {record.name!r}, as in {_facts_file(names[record.name])}",
-                source=_facts_file(record),
-                field="name",
-                fix="Give each record a name of its own, or leave the field out: then it is that"
-                " of the file.",
-            )
-        seen[content] = names[record.name] = record
-
-
-def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -> None:
+def _check_phases(records: Sequence[SliceRecord]) -> None:
     cut = [r for r in records if not is_bare(r)]
-    if not cut:
-        raise ConfigurationError(
-            "in none of the records is there food",
-            source=records[0].source,
-            field="food.name",
-            fix="Add records of slices; those of air, board and weight go with them.",
-        )
     if all(r.metadata.motion.phases and not r.phase(*CUTTING).any() for r in cut):
         raise ConfigurationError(
             "in none of the records is a phase labelled slice: nothing is cut",
-            source=_facts_file(cut[0]),
+            source=facts_file(cut[0]),
             field="motion.phases",
             fix="Add records of slices, and label the time in which the knife cuts as slice.",
-        )
-    foods: dict[str, list[SliceRecord]] = {}
-    for record in cut:
-        foods.setdefault(record.metadata.food.name, []).append(record)
-    if len(foods) > 1:
-        few = min(foods, key=lambda name: len(foods[name]))
-        counts = ", ".join(f"{len(own)} of {name}" for name, own in foods.items())
-        raise ConfigurationError(
-            f"the records are of different foods: {counts}",
-            source=_facts_file(foods[few][0]),
-            field="food.name",
-            fix="Put each food into a folder of its own and diagnose them one by one; correct the"
-            " field if it is one food under two names.",
-        )
-    (name,) = foods
-    named = not {name, food.name} & {*UNNAMED}
-    if named and name.lower() != food.name.lower() and not other_food:
-        raise ConfigurationError(
-            f"the records are of {name}, the model is of {food.name}",
-            source=_facts_file(foods[name][0]),
-            field="food.name",
-            fix=f"Give the model of that food (--model {name}; sliceit calibrate makes one), or say"
-            " --other-food if you mean it.",
         )
 
 
@@ -218,7 +160,7 @@ def _check_board(record: SliceRecord, records: Sequence[SliceRecord]) -> None:
         raise ConfigurationError(
             f"is {facts.board_height:g} m, and the food, whose position is on the board, is at"
             f" {heights[0]:g} m: {1e3 * abs(above):.3g} mm {'above' if above > 0 else 'below'} it",
-            source=_facts_file(record),
+            source=facts_file(record),
             field="board_height",
             fix="Correct board_height or food.position; both are in the world frame, in metres.",
         )
@@ -337,10 +279,10 @@ def _conditions(records: Sequence[SliceRecord]) -> list[str]:
             draws = (motion.draw_ratio or 0.0), (was.draw_ratio or 0.0)
             if differs or abs(draws[0] - draws[1]) > SAME_DRAW:
                 raise ConfigurationError(
-                    f"is {label!r}, as that of {_facts_file(other)}, which was cut at"
+                    f"is {label!r}, as that of {facts_file(other)}, which was cut at"
                     f" {was.speed:g} m/s with a draw of {draws[1]:g}, not {motion.speed:g} m/s with"
                     f" {draws[0]:g}",
-                    source=_facts_file(record),
+                    source=facts_file(record),
                     field="condition",
                     fix="Give different cuts different conditions: what replicates do not share is"
                     " taken for noise.",

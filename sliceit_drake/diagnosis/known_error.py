@@ -68,6 +68,7 @@ def learn_known_error(
     cache: Path | None = None,
     workers: Workers = None,
     progress: Callable[[str, int, int], None] | None = None,
+    other_food: bool = False,
 ) -> KnownError:
     """What simulations of a calibrated food get wrong in records: the mean over each kind of cut,
     once what slices of that kind differ in as a whole (toughness, modulus, friction, height) is
@@ -76,14 +77,14 @@ def learn_known_error(
     Args:
         setup: Of the food at its calibrated values.
         records: As `diagnose` takes them.
-        cache, workers, progress: As there.
+        cache, workers, progress, other_food: As there.
 
     Raises:
         ConfigurationError: The records do not carry a diagnosis, naming file and field.
         CuttingError: The prediction itself broke down.
     """
     show = progress or (lambda *_: None)
-    check_records(records, setup.food)
+    check_records(records, setup.food, other_food)
     keys = [record_key(r) for r in records]
     records = without_lone_torques(records)
     every_sensor = {name for name, _ in USUAL}
