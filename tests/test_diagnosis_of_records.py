@@ -25,8 +25,8 @@ from sliceit_drake.diagnosis.evidence.verdict import LAW
 from sliceit_drake.diagnosis.known_error import learn_known_error
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.result import Diagnosis
-from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.spikes import without_spikes
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings

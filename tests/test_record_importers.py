@@ -315,6 +315,22 @@ def test_the_contact_is_found_at_any_rate_and_the_rate_is_noted(tmp_path, rate):
     assert np.isfinite(target.measured).all() and abs(target.depth[-1] - 0.026) < 1.5e-3
 
 
+@pytest.mark.parametrize("first", [0.2, 0.55])
+def test_the_contact_is_found_with_few_rows_before_it_and_not_where_there_are_none(tmp_path, first):
+    """Of a sensor of 20 Hz: 0.3 s in the air, or none."""
+    rows = slice_in_air_and_food(20.0)
+    np.savetxt(tmp_path / "a.csv", rows[rows[:, 0] > first - 1e-9], delimiter=",", fmt="%.5f")
+    metadata = facts()
+    metadata.motion.speed = None
+    record = import_force(tmp_path / "a.csv", metadata, component="vertical")
+    assert [p.label for p in record.metadata.motion.phases] == ["air", "slice"][first > 0.5 :]
+    assert first > 0.5 or record.metadata.motion.phases[1].start == pytest.approx(0.5, abs=0.051)
+    if first > 0.5:
+        metadata.motion.speed = 0.03
+        with pytest.raises(ConfigurationError, match="first to the last row.* give --contact S"):
+            import_force(tmp_path / "a.csv", metadata, component="vertical")
+
+
 @pytest.mark.parametrize(
     ("header", "separator", "decimal"),
     [("Zeit (ms);Kraft (kN)\n", ";", ","), ("time\tforce\n(ms)\t(kN)\n", "\t", ".")],
@@ -607,11 +623,12 @@ def test_an_import_writes_over_no_measurement_and_over_no_record_unasked(tmp_pat
 
 def test_a_spike_above_all_forces_does_not_hide_the_contact(tmp_path, capsys):
     rows = slice_in_air_and_food()
-    rows[600, 1] = 2000.0
+    rows[[20, 600], 1] = -500.0, 2000.0
     said = import_by_hand(tmp_path, rows, capsys, "--component", "vertical", "--speed", "0.02")[1]
     begins = float(re.search(r"The force begins at (\S+) s", said)[1])
     assert begins == pytest.approx(0.5, abs=0.02)
-    assert "1 row far from those before and after" in said
+    assert "2 rows far from those before and after" in said
+    assert "is level" not in said
 
 
 @pytest.mark.parametrize("level", [10.0, 0.0])

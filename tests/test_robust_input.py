@@ -13,7 +13,7 @@ from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.verdict import reach_verdict
 from sliceit_drake.diagnosis.input_checks import check_records
-from sliceit_drake.prediction.noise import without_spikes
+from sliceit_drake.records.spikes import without_spikes
 
 RNG_SEED = 5
 

@@ -258,7 +258,7 @@ def _check_target(target: Path, options: argparse.Namespace) -> None:
 
 def _say_what_was_taken(record: "SliceRecord") -> None:
     """What the command found by itself, so that a user sees where it erred."""
-    from sliceit_drake.prediction.noise import without_spikes
+    from sliceit_drake.records.spikes import without_spikes
 
     facts = record.metadata
     begins = [phase.start for phase in facts.motion.phases if phase.label == "slice"]

@@ -14,10 +14,10 @@ from scipy.ndimage import median_filter
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.shapes import PlainShape
-from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_set import check_foods, check_same_slice, facts_file
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.spikes import without_spikes
 from sliceit_drake.records.validation import check_record
 
 __all__ = ["check_records", "without_lone_torques"]

@@ -17,12 +17,12 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.prediction.clock import Clock, Stretches
-from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.prediction.simulator import JobResult
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.spikes import without_spikes
 from sliceit_drake.tables import interpolated
 
 __all__ = ["CHANNELS", "Bench", "Meshing", "RecordTarget", "make_targets"]

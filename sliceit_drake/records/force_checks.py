@@ -7,6 +7,7 @@ from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import Findings, runs
 from sliceit_drake.records.preprocessing import MIN_AIR_ROWS
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
+from sliceit_drake.records.spikes import without_spikes
 
 __all__ = ["check_force", "flat_top"]
 
@@ -163,8 +164,9 @@ def _ends(mask: np.ndarray) -> tuple[int, int]:
 
 
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
-    """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
-    force = record.measured_force
+    """Standard deviation in the air of the noisiest component, N, after drift, without spikes; 0 if
+    not known."""
+    force = without_spikes(record.measured_force)[0]
     if air.sum() < MIN_AIR_ROWS:
         return 0.0
     return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
@@ -297,7 +299,7 @@ def _check_end(record: SliceRecord, air: np.ndarray, cut: np.ndarray, findings: 
     rows = np.flatnonzero(cut)
     if len(rows) < 2 * MIN_AIR_ROWS:
         return
-    force = record.measured_force[rows]
+    force = without_spikes(record.measured_force)[0][rows]
     force = force[:, [np.ptp(force, axis=0).argmax()]]
     around = np.median(force[-max(MIN_AIR_ROWS, len(rows) // 20) :])
     least = max(LEVEL * np.ptp(force), 5.0 * _noise(record, air))

@@ -23,8 +23,9 @@ SLOWEST = 0.25
 """Rows further apart than this, s, are in another unit: a slice lasts a second or a few."""
 LONG_AGO = 1e6
 """A table whose first time is later than this, s, has that of a clock, such as Unix time."""
-EARLY = 10
-"""Rows at least that tell whether a record begins in the air, where the force is level."""
+EARLY, FEWEST, BEFORE = 10, 6, 0.25
+"""Rows that tell whether a record begins in the air, where the force is level; of a slow sensor
+fewer, as many as it has in this time, s: the knife may meet the food soon after."""
 ONSET = 0.02
 """Fraction of the greatest force at which contact begins, where the noise is smaller."""
 NOISES = 5.0
@@ -124,9 +125,12 @@ def find_contact(time: np.ndarray, force: np.ndarray, file: str = "") -> float |
     Raises:
         ConfigurationError: There is no contact.
     """
-    early = force[: max(EARLY, len(force) // 50)]
+    soon = int(np.searchsorted(time, time[0] + BEFORE, "right"))
+    early = force[: max(FEWEST, min(EARLY, soon), len(force) // 50)]
     third = len(early) // 3
-    scatter = float(np.median(np.abs(np.diff(early))))
+    steps = np.diff(early)
+    # A force that rises from the first row on is no scatter.
+    scatter = float(np.median(np.abs(steps - np.median(steps))))
     away = np.abs(force - np.median(early))
     # The quantile, for a faulty cable's rows are higher than any force.
     peak = float(np.quantile(away, 0.99))

@@ -27,6 +27,7 @@ from sliceit_drake.records.slice_record import (
     record_from_table,
     velocities,
 )
+from sliceit_drake.records.spikes import without_spikes
 from sliceit_drake.tables import read_columns, read_rows, require_increasing
 
 __all__ = [
@@ -208,8 +209,9 @@ def import_force(
             fix="Give first and last time of the slice, in seconds of the table"
             + (" after its first row." if table.start else "."),
         )
-    # The component that changes most, with its sign.
-    most = force[:, np.ptp(force, axis=0).argmax()]
+    # The component that changes most, with its sign; a fault of the cable is no slice.
+    clean, _ = without_spikes(force)
+    most = clean[:, np.ptp(clean, axis=0).argmax()]
     one_slice(time, most, str(file))
     facts = copy.deepcopy(metadata)
     if contact is None and not facts.motion.phases:
@@ -218,7 +220,7 @@ def import_force(
         begins = time[0] if contact is None else contact
         facts.motion.speed = facts.food.size[2] / float(time[-1] - begins)
         facts.unknown = [*(n for n in facts.unknown if n != "motion.speed"), "motion.speed"]
-    _check_way(facts, float(time[-1] - (time[0] if contact is None else contact)), str(file))
+    _check_way(facts, time, contact, str(file))
     if facts.sensor.rate is None and "sensor.rate" not in facts.unknown:
         facts.sensor.rate = float(f"{1.0 / np.median(np.diff(time)):.4g}")
     step = ProcessingStep("import_force", {}, "the motion is nominal")
@@ -296,19 +298,22 @@ def imported_facts(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:
     return facts
 
 
-def _check_way(facts: SliceMetadata, duration: float, file: str) -> None:
+def _check_way(facts: SliceMetadata, time: np.ndarray, contact: float | None, file: str) -> None:
     """Refuses a nominal knife that goes through the board."""
     if facts.motion.speed is None or facts.food.size is None:
         return
+    duration = float(time[-1] - (time[0] if contact is None else contact))
+    found = contact is not None or facts.motion.phases
     way, height = facts.motion.speed * duration, facts.food.size[2]
     if way > height + THROUGH:
         raise ConfigurationError(
             f"{facts.motion.speed:.3g} m/s brings the knife {1e3 * way:.0f} mm down in the "
-            f"{duration:.3g} s from the contact to the last row, and the food is "
-            f"{1e3 * height:.0f} mm high",
+            f"{duration:.3g} s from the {'contact' if found else 'first'} to the last row, and the "
+            f"food is {1e3 * height:.0f} mm high",
             source=file,
             field="motion.speed",
-            fix="Correct speed or size; if the knife stops or goes back, end the record there by "
+            fix=("" if found else "If the knife begins in the air, give --contact S. ")
+            + "Correct speed or size; if the knife stops or goes back, end the record there by "
             "--between START END.",
         )
 
