@@ -8,7 +8,33 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, closest
 
-__all__ = ["finite_number", "interpolated", "read_columns", "read_rows", "require_increasing"]
+__all__ = [
+    "finite_number",
+    "interpolated",
+    "read_columns",
+    "read_rows",
+    "read_text",
+    "require_increasing",
+]
+
+
+def read_text(file: str | Path) -> str:
+    """The text of a table, UTF-8, with or without the mark that some programs begin it with.
+
+    Raises:
+        ConfigurationError: If the file cannot be read.
+    """
+    fix = "Check the path."
+    try:
+        return Path(file).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        problem = str(error)
+    except UnicodeDecodeError as error:
+        problem, fix = (
+            f"it is not UTF-8: {error}",
+            "Save it as UTF-8, which spreadsheets call CSV UTF-8.",
+        )
+    raise ConfigurationError(f"the table cannot be read ({problem})", source=str(file), fix=fix)
 
 
 def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
@@ -19,19 +45,14 @@ def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
     Raises:
         ConfigurationError: If the file cannot be read.
     """
+    rows = enumerate(csv.reader(read_text(file).splitlines()), start=1)
     try:
-        with open(file, newline="", encoding="utf-8") as stream:
-            rows = enumerate(csv.reader(stream), start=1)
-            return [(number, [cell.strip() for cell in row]) for number, row in rows if row]
+        return [(number, [cell.strip() for cell in row]) for number, row in rows if row]
     except csv.Error as error:
         raise ConfigurationError(
             f"the table cannot be read ({error})",
             source=str(file),
             fix="Is there a quotation mark too many, or none of a pair? Remove it.",
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
         ) from error
 
 
@@ -53,7 +74,7 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
     header = rows[0][1] if rows else []
     for name in columns:
         if name not in header:
-            close = closest(name, header)
+            close = closest(name, [other for other in header if other not in columns])
             fix = f'Rename "{close}"?' if close else "Add it."
             raise ConfigurationError(
                 f'there is no column "{name}"; the first row has: {", ".join(header) or "nothing"}',

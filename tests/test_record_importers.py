@@ -116,6 +116,14 @@ def test_a_recording_without_a_needed_variable_is_refused(tmp_path):
         import_ur_rtde(tmp_path / "run.csv", SliceMetadata(), X_TK)
 
 
+def test_a_missing_column_is_no_misspelling_of_another_that_is_read(tmp_path):
+    rows = RECORDING.read_text(encoding="utf-8").replace("actual_TCP_speed", "speed")
+    (tmp_path / "run.csv").write_text(rows, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match='no column "actual_TCP_speed_0"') as error:
+        import_ur_rtde(tmp_path / "run.csv", SliceMetadata(), X_TK)
+    assert "actual_TCP_pose" not in error.value.fix
+
+
 def test_phases_of_a_recording_follow_from_its_motion(tmp_path):
     truth = example_slice()
     write_recording(truth, tmp_path / "run.csv")
@@ -333,7 +341,12 @@ def test_the_contact_is_found_with_few_rows_before_it_and_not_where_there_are_no
 
 @pytest.mark.parametrize(
     ("header", "separator", "decimal"),
-    [("Zeit (ms);Kraft (kN)\n", ";", ","), ("time\tforce\n(ms)\t(kN)\n", "\t", ".")],
+    [
+        ("Zeit (ms);Kraft (kN)\n", ";", ","),
+        ("time\tforce\n(ms)\t(kN)\n", "\t", "."),
+        ("t_ms   F_kN\n", "   ", ","),
+        ("\ufefft_ms, F_kN\n", ", ", "."),
+    ],
 )
 def test_units_and_separators_of_other_labs_are_read(tmp_path, header, separator, decimal):
     known = slice_in_air_and_food()
@@ -345,6 +358,22 @@ def test_units_and_separators_of_other_labs_are_read(tmp_path, header, separator
     record = import_force(tmp_path / "a.csv", facts(), component="vertical")
     np.testing.assert_allclose(record.time, known[:, 0], atol=1e-9)
     assert record.force_vertical[-1] == pytest.approx(known[-1, 1], abs=0.02)
+
+
+def test_decimal_commas_in_quotation_marks_separate_no_cells(tmp_path):
+    rows = '"time","force"\n"0,002","1,5"\n"0,004","-2,5"\n'
+    (tmp_path / "a.csv").write_text(rows, encoding="utf-8")
+    table = read_force_table(tmp_path / "a.csv")
+    np.testing.assert_allclose(table.time, [0.002, 0.004])
+    np.testing.assert_allclose(table.force[:, 0], [1.5, -2.5])
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "cp1252"])
+def test_a_table_in_another_encoding_is_to_be_saved_as_utf_8(tmp_path, encoding):
+    (tmp_path / "a.csv").write_text("t,Kraft für N\n0,1\n", encoding=encoding)
+    for read in (read_force_table, lambda file: import_ur_rtde(file, SliceMetadata(), X_TK)):
+        with pytest.raises(ConfigurationError, match="a.csv: .*not UTF-8.* Save it as UTF-8"):
+            read(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize(

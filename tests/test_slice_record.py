@@ -228,3 +228,10 @@ def test_a_time_far_from_zero_is_written_to_the_microsecond(tmp_path):
         phase.start, phase.end = phase.start + 1772323200.0, phase.end + 1772323200.0
     table = read_table(write_record(record, tmp_path / "late"))
     np.testing.assert_allclose(table.columns["time"] - record.time, 0.0, atol=1e-6)
+
+
+def test_a_table_may_begin_with_the_mark_of_utf_8(tmp_path):
+    file = write_record(example_slice(), tmp_path / "marked")
+    known = read_table(file)
+    file.write_text("\ufeff" + file.read_text(encoding="utf-8"), encoding="utf-8")
+    np.testing.assert_array_equal(read_table(file).columns["time"], known.columns["time"])

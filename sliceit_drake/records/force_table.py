@@ -1,5 +1,6 @@
 """Force curves of any lab: time and force from a CSV file, and where in it a slice is."""
 
+import csv
 import dataclasses as dc
 import re
 from collections.abc import Sequence
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.tables import finite_number, require_increasing
+from sliceit_drake.tables import finite_number, read_text, require_increasing
 
 __all__ = ["UNITS", "ForceTable", "find_contact", "one_slice", "read_force_table"]
 
@@ -19,6 +20,9 @@ NEWTONS |= dict.fromkeys(("g", "gf"), 9.80665e-3) | dict.fromkeys(("kg", "kgf", 
 NEWTONS |= dict.fromkeys(("lbf", "lbs", "lb"), 4.4482216)
 UNITS = SECONDS | NEWTONS
 """Units of time and force by name, in small letters: s and N."""
+NUMBER = r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?"
+SPACED = re.compile(rf"{NUMBER}(\s+{NUMBER})+")
+"""A line of numbers with decimal commas and spaces between."""
 SLOWEST = 0.25
 """Rows further apart than this, s, are in another unit: a slice lasts a second or a few."""
 LONG_AGO = 1e6
@@ -185,20 +189,22 @@ def one_slice(time: np.ndarray, force: np.ndarray, file: str = "") -> None:
 
 def _rows(file: str | Path) -> list[tuple[int, list[str]]]:
     """Cells of all lines that hold something, with their numbers."""
-    try:
-        text = Path(file).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
-        ) from error
     lines = [
         (number, line.strip())
-        for number, line in enumerate(text.splitlines(), start=1)
+        for number, line in enumerate(read_text(file).splitlines(), start=1)
         if line.strip() and not line.startswith("#")
     ]
     body = [line for _, line in lines[len(lines) // 4 :]]
     separator = next((s for s in ";\t," if body and all(s in line for line in body)), None)
-    return [(n, [c.strip().strip('"') for c in line.split(separator)]) for n, line in lines]
+    if separator == "," and all(SPACED.fullmatch(line) for line in body):
+        separator = None
+    return [(number, _cells(line, separator)) for number, line in lines]
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    """Cells of a line, in which a separator between quotation marks is none."""
+    cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator))
+    return [cell.strip().strip('"') for cell in cells]
 
 
 def _number(cell: str) -> float:
