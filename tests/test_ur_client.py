@@ -8,6 +8,7 @@ import pytest
 from emulator_bench import free_address
 
 from sliceit_drake.emulator.process import EmulatorProcess
+from sliceit_drake.hardware.client import RUNTIME_STATES
 from sliceit_drake.hardware.rtde_link import HALT_TIME
 from sliceit_drake.hardware.ur_client import ATTEMPT, UrClient
 
@@ -70,3 +71,34 @@ def test_where_no_data_come_the_dashboard_can_confirm_that_the_program_has_stopp
 
 def test_both_ways_to_stop_are_tried_before_the_operator_is_told_that_none_did():
     assert 2.0 * ATTEMPT < HALT_TIME
+
+
+@pytest.mark.parametrize("fault", ["safeguard_stop", "protective_stop", "program_paused"])
+def test_a_paused_program_is_stopped_so_that_nobody_can_resume_it(fault):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        client = UrClient(emulator.address, 0.03, 2000.0)
+        try:
+            emulator.pendant.inject(fault)
+            end = time.monotonic() + 20.0
+            while client.read().runtime_state != RUNTIME_STATES.index("paused"):
+                assert time.monotonic() < end, "it is not paused"
+            client.stop()
+            assert emulator.pendant.status()["runtime_state"] == "STOPPED"
+            emulator.pendant.inject("normal")
+            emulator.pendant.inject("program_resumed")
+            assert emulator.pendant.status()["runtime_state"] == "STOPPED"
+        finally:
+            client.close()
+
+
+def test_a_program_that_stays_paused_is_not_told_to_be_stopped(monkeypatch):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        client = UrClient(emulator.address, 0.03, 2000.0)
+        try:
+            emulator.pendant.inject("program_paused")
+            # A robot in local control refuses what its dashboard is asked to do.
+            monkeypatch.setattr(client, "_stop_by_dashboard", client._has_ended)
+            with pytest.raises(RuntimeError, match="plays or is paused"):
+                client.stop()
+        finally:
+            client.close()

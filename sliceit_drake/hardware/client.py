@@ -9,6 +9,7 @@ __all__ = [
     "RUNNING",
     "RUNTIME_STATES",
     "SAFE_BITS",
+    "STOPPED",
     "RobotClient",
     "RobotFacts",
     "RobotState",
@@ -17,7 +18,7 @@ __all__ = [
     "safety_text",
 ]
 
-PLAYING = 2
+STOPPED, PLAYING = 1, 2
 RUNNING = 7
 RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
 

@@ -98,12 +98,16 @@ def stop_by_dashboard(host: str) -> str | None:
             with socket.create_connection((host, DASHBOARD_PORT), 2.0) as connection:
                 lines = connection.makefile("rwb")
                 lines.readline()
-                for question in (b"stop\n", b"running\n"):
+                answers = []
+                for question in (b"stop\n", b"running\n", b"programState\n"):
                     lines.write(question)
                     lines.flush()
-                    problem = lines.readline().decode("utf-8", "replace").strip()
-                if problem.lower() == "program running: false":
-                    return None
+                    answers.append(lines.readline().decode("utf-8", "replace").strip())
+                # One that is paused does not run, but goes on when somebody resumes it.
+                if answers[1].lower() == "program running: false":
+                    if answers[2].startswith("STOPPED"):
+                        return None
+                problem = ", ".join(answers[1:])
         except OSError as error:
             problem = str(error)
         time.sleep(0.1)

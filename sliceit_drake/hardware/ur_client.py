@@ -13,7 +13,13 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState, RobotUnavailableError
+from sliceit_drake.hardware.client import (
+    PLAYING,
+    STOPPED,
+    RobotFacts,
+    RobotState,
+    RobotUnavailableError,
+)
 from sliceit_drake.hardware.control_script import NOTHING, control_script, upload
 from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.hardware.supervisor import Supervisor
@@ -221,23 +227,30 @@ class UrClient:
                 errors.append(error)
             self._control.stopScript()
 
-        # While ur_rtde reconnects, a call can end the process.
-        if self.is_connected() and not self._was_lost:
+        # While ur_rtde reconnects, a call can end the process. A paused program does not listen.
+        listens = self._receive.getRuntimeState() == PLAYING
+        if listens and self.is_connected() and not self._was_lost:
             if self._ends(end_program, before) and not errors:
                 return
         # The dashboard has a connection of its own, and needs no program that listens.
         if not self._ends(self._stop_by_dashboard, before):
             reason = f" ({errors[0]})" if errors else ""
-            raise RuntimeError(f"the robot's program still plays, or no data come{reason}")
+            raise RuntimeError(f"the robot's program plays or is paused, or no data come{reason}")
 
     def _stop_by_dashboard(self) -> bool:
         self._dashboard.stop()
-        return not self._dashboard.running()
+        return self._has_ended()
+
+    def _has_ended(self) -> bool:
+        """Whether the dashboard knows of no program that plays, nor of one that could go on."""
+        dashboard = self._dashboard
+        return not dashboard.running() and dashboard.programState().startswith("STOPPED")
 
     def _ends(self, ask: Callable[[], object], before: float) -> bool:
         """Whether the program ends in time that is asked to, by data newer than `before`, s.
 
-        What asks may block for ever; where it returns True it knows that the program has ended.
+        A paused one has not ended: it goes on when somebody resumes it. What asks may block for
+        ever; where it returns True it knows that the program has ended.
         """
         known: list[bool] = []
 
@@ -249,7 +262,7 @@ class UrClient:
         asking.start()
         deadline = time.monotonic() + self._attempt
         receive = self._receive
-        while receive.getRuntimeState() == PLAYING or receive.getTimestamp() == before:
+        while receive.getRuntimeState() != STOPPED or receive.getTimestamp() == before:
             if known == [True]:
                 return True
             if time.monotonic() > deadline:
