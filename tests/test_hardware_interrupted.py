@@ -198,3 +198,16 @@ with supervisor.Supervisor("{emulator.address}") as watched:
     assert any("stopped by the dashboard" in text for _, text in status["log"])
     assert process.returncode == 1
     assert "HAS CRASHED. The robot's program was stopped through its dashboard" in printed
+
+
+def test_a_robot_that_never_confirms_its_stop_is_an_error_that_names_the_emergency_stop():
+    script = f"""
+from sliceit_drake.hardware.supervisor import Supervisor
+with Supervisor("{free_address()}") as supervisor:
+    supervisor.begin()
+"""
+    # Nothing answers there.
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "THE ROBOT HAS NOT CONFIRMED THAT ITS PROGRAM IS STOPPED. Stay away" in done.stderr
+    assert "RobotUnavailableError" in done.stderr and "emergency stop" in done.stderr

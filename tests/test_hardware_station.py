@@ -451,6 +451,20 @@ def test_a_robot_that_does_not_confirm_its_stop_is_named(robot, monkeypatch, cap
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
 
 
+def test_a_motion_that_ends_without_a_confirmed_stop_is_no_success(
+    robot, monkeypatch, capsys, tmp_path
+):
+    def stop():
+        raise RuntimeError("no answer")
+
+    robot.stop = stop
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    made = checked_run(robot, tmp_path)
+    assert "complete, but the robot has not confirmed" in made.stopped
+    assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
+    assert json.loads((tmp_path / "summary.json").read_text())["stopped"] == made.stopped
+
+
 def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):
     for file in resource_path("hardware").glob("*.yaml"):
         load_hardware_config(file)

@@ -10,6 +10,7 @@ from emulator_bench import free_address
 from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.hardware.client import RUNTIME_STATES
 from sliceit_drake.hardware.rtde_link import HALT_TIME
+from sliceit_drake.hardware.supervisor import Supervisor
 from sliceit_drake.hardware.ur_client import ATTEMPT, UrClient
 
 pytestmark = pytest.mark.usefixtures("no_test_hangs")
@@ -102,3 +103,33 @@ def test_a_program_that_stays_paused_is_not_told_to_be_stopped(monkeypatch):
                 client.stop()
         finally:
             client.close()
+
+
+def test_a_stop_that_is_not_confirmed_is_told_and_tried_once_more(monkeypatch, capfd):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        with Supervisor(emulator.address) as supervisor:
+            client = UrClient(emulator.address, 0.03, 2000.0, supervisor=supervisor)
+            monkeypatch.setattr(client, "_ends", lambda *_: False)
+            client.close()
+        status = emulator.pendant.status()
+    assert status["runtime_state"] == "STOPPED"
+    assert any("stopped by the dashboard" in text for _, text in status["log"])
+    told = capfd.readouterr().err
+    assert "NOT CONFIRMED THAT ITS PROGRAM IS STOPPED. Stay away" in told
+    assert "ENDS WITHOUT A CONFIRMED STOP OF THE ROBOT. The robot's program was stopped" in told
+
+
+def test_without_a_supervisor_a_stop_that_is_not_confirmed_is_an_error(monkeypatch):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        client = UrClient(emulator.address, 0.03, 2000.0)
+        monkeypatch.setattr(client, "_ends", lambda *_: False)
+        with pytest.raises(RuntimeError, match="plays or is paused"):
+            client.close()
+
+
+def test_a_confirmed_stop_leaves_the_supervisor_nothing_to_say(capfd):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        with Supervisor(emulator.address) as supervisor:
+            UrClient(emulator.address, 0.03, 2000.0, supervisor=supervisor).close()
+        log = [text for _, text in emulator.pendant.status()["log"]]
+    assert capfd.readouterr().err == "" and not any("by the dashboard" in text for text in log)

@@ -157,7 +157,11 @@ class RobotClient(Protocol):
         """
 
     def close(self) -> None:
-        """Stops the program on the robot, if it was not stopped, and disconnects."""
+        """Stops the program on the robot, if it was not stopped, and disconnects.
+
+        Raises:
+            RuntimeError: The program does not stop, and nobody else sees to it.
+        """
 
 
 def is_loopback(host: str) -> bool:

@@ -3,8 +3,8 @@
 ur_rtde can end a process in the middle of a motion, by an abort or a segmentation fault; then no
 line of Python runs there any more. It can also wait for ever, with Python's lock held: `limit` ends
 the run's process then. This process only reads a pipe from it. If the pipe ends without the word
-that all is done, or nothing comes for a while, it stops the robot's program through the dashboard
-server.
+that the robot's program is stopped, or nothing comes for a while, it stops that program through the
+dashboard server.
 """
 
 import contextlib
@@ -18,6 +18,8 @@ import threading
 import time
 from collections.abc import Iterator
 
+from sliceit_drake.hardware.client import RobotUnavailableError
+
 __all__ = ["Supervisor", "stop_by_dashboard"]
 
 DASHBOARD_PORT = 29999
@@ -29,7 +31,11 @@ SILENCE = 1.5 * CALL_TIME
 """How long a process that controls a robot may show no life, s."""
 BEAT = 0.5
 """Time between two signs of its life, s."""
-_CONTROL, _ALIVE, _DONE = b"control\n", b".", b"done\n"
+_CONTROL, _ALIVE, _DONE, _UNSURE = b"control\n", b".", b"done\n", b"unsure\n"
+_UNSURE_TEXT = (
+    "\nTHE ROBOT HAS NOT CONFIRMED THAT ITS PROGRAM IS STOPPED. Stay away: its dashboard is asked "
+    f"for up to {PATIENCE:g} s."
+)
 
 
 class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
@@ -46,12 +52,18 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             stdin=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
         self._is_over = threading.Event()
+        self._is_stopped = True
         self._beats = threading.Thread(target=self._live, daemon=True)
 
     def begin(self) -> None:
         """Says that this process takes control of the robot: its end or silence stops the robot."""
+        self._is_stopped = False
         self._say(_CONTROL)
         self._beats.start()
+
+    def confirm(self) -> None:
+        """Says that the robot's program is known to be stopped: only then all is done."""
+        self._is_stopped = True
 
     def _live(self) -> None:
         while not self._is_over.wait(BEAT):
@@ -79,11 +91,25 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             self._process.stdin.flush()
 
     def __exit__(self, *_: object) -> None:
+        """Ends it; a robot that has not confirmed its stop is stopped by the other process first.
+
+        Raises:
+            RobotUnavailableError: It has not confirmed that one either.
+        """
         self._is_over.set()
         if self._beats.ident is not None:
             self._beats.join()
-        self._say(_DONE)
+        self._say(_DONE if self._is_stopped else _UNSURE)
+        if not self._is_stopped:
+            # The other process is at work already: a terminal that stands delays nothing.
+            with contextlib.suppress(OSError):
+                print(_UNSURE_TEXT, file=sys.stderr, flush=True)
         self._process.communicate()
+        if not self._is_stopped and self._process.returncode != 0:
+            raise RobotUnavailableError(
+                "The robot did not confirm that its program is stopped. Use the emergency stop "
+                "before you go near it; then find out why it does not answer."
+            )
 
 
 def stop_by_dashboard(host: str) -> str | None:
@@ -114,9 +140,9 @@ def stop_by_dashboard(host: str) -> str | None:
     return problem or "it does not answer"
 
 
-def _watch(host: str) -> None:
+def _watch(host: str) -> int:
     """Waits for the end, or the silence, of the process that has the other end of standard
-    input."""
+    input; returns an exit code."""
     said, what = b"", "HAS CRASHED"
     pipe = sys.stdin.fileno()
     while True:
@@ -129,7 +155,9 @@ def _watch(host: str) -> None:
             break
         said = (said + new).replace(_ALIVE, b"")
     if not said.startswith(_CONTROL) or said.endswith(_DONE):
-        return
+        return 0
+    if said.endswith(_UNSURE):
+        what = "ENDS WITHOUT A CONFIRMED STOP OF THE ROBOT"
     problem = stop_by_dashboard(host)
     text = f"THE PROGRAM THAT DROVE THE ROBOT {what}. "
     if problem is None:
@@ -140,7 +168,8 @@ def _watch(host: str) -> None:
             "emergency stop before you go near it."
         )
     print(f"\n{text}", file=sys.stderr, flush=True)
+    return 0 if problem is None else 1
 
 
 if __name__ == "__main__":
-    _watch(sys.argv[1])
+    sys.exit(_watch(sys.argv[1]))

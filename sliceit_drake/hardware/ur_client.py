@@ -55,7 +55,7 @@ class UrClient:
         gain: Argument of servoj, 100 to 2000.
         limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
-        supervisor: Is told when this takes control, and limits calls that can wait for ever with
+        supervisor: Is told when this takes control and when the program is stopped, and limits calls that can wait for ever with
             Python's lock held; None for nobody.
 
     Raises:
@@ -72,6 +72,7 @@ class UrClient:
         pace: float = 1.0,
         supervisor: Supervisor | None = None,
     ) -> None:
+        self._supervisor = supervisor
         self._limit = contextlib.nullcontext if supervisor is None else supervisor.limit
         try:
             import dashboard_client
@@ -215,6 +216,12 @@ class UrClient:
 
     def stop(self) -> None:
         self._is_stopped = True
+        self._stop()
+        if self._supervisor is not None:
+            self._supervisor.confirm()
+
+    def _stop(self) -> None:
+        """Stops the program in one of two ways; raises RuntimeError where neither is confirmed."""
         before, errors = self._receive.getTimestamp(), []
 
         def end_program() -> None:
@@ -304,10 +311,17 @@ class UrClient:
         return self._ask(self._control.moveJ, q, speed, acceleration, True)
 
     def close(self) -> None:
-        if not self._is_stopped:
-            # Left alone it would go on with what it does.
-            with contextlib.suppress(RuntimeError):
-                self.stop()
+        try:
+            if not self._is_stopped:
+                self.stop()  # Left alone it would go on with what it does.
+        except RuntimeError:
+            # The supervisor was told of no stop: at its end it stops the robot, and says so.
+            if self._supervisor is None:
+                raise
+        finally:
+            self._disconnect()
+
+    def _disconnect(self) -> None:
         parts = self._control, self._receive, self._dashboard
         if self._was_lost or not self.is_connected():
             LOST.extend(parts)

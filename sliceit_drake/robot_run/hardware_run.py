@@ -176,6 +176,8 @@ class HardwareRun:
             stop = self.stop = link.finish(reason)
         if stop.limit != "end":
             self.run.stopped = str(stop)
+        elif link.stop_error is not None:
+            self.run.stopped = f"{reason}, but the robot has not confirmed that it is stopped"
         return self.run
 
     def _prepare(self, station: HardwareStation) -> Run:
