@@ -133,3 +133,18 @@ def test_a_confirmed_stop_leaves_the_supervisor_nothing_to_say(capfd):
             UrClient(emulator.address, 0.03, 2000.0, supervisor=supervisor).close()
         log = [text for _, text in emulator.pendant.status()["log"]]
     assert capfd.readouterr().err == "" and not any("by the dashboard" in text for text in log)
+
+
+def test_ctrl_c_while_control_is_taken_stops_the_program(monkeypatch):
+    def interrupted(client, _):
+        while not client._control.isProgramRunning():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(UrClient, "_await_program", interrupted)
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        with pytest.raises(KeyboardInterrupt):
+            UrClient(emulator.address, 0.03, 2000.0)
+        status = emulator.pendant.status()
+    assert any(text.startswith("program started") for _, text in status["log"])
+    assert status["runtime_state"] == "STOPPED"

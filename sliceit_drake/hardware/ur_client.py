@@ -55,8 +55,8 @@ class UrClient:
         gain: Argument of servoj, 100 to 2000.
         limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
-        supervisor: Is told when this takes control and when the program is stopped, and limits calls that can wait for ever with
-            Python's lock held; None for nobody.
+        supervisor: Is told when this takes control and when the program is stopped, and limits
+            calls that can wait for ever with Python's lock held; None for nobody.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
@@ -106,11 +106,14 @@ class UrClient:
             script = control_script(limits.joint_step, max(limits.joint_speed))
             if supervisor is not None:
                 supervisor.begin()
-            self._script = upload(host, script)
             try:
+                self._script = upload(host, script)
                 self._await_program(START_TIME / max(pace, SLOWEST))
-            except RuntimeError:
-                self._dashboard.stop()  # It may begin yet.
+            except BaseException:
+                # It may play already, or begin yet; so may it where somebody presses Ctrl-C. The
+                # supervisor is not told of a stop, and asks once more at the end.
+                with contextlib.suppress(RuntimeError):
+                    self._dashboard.stop()
                 raise
         except (RuntimeError, OSError) as error:
             if isinstance(error, RobotUnavailableError):
