@@ -32,6 +32,7 @@ from sliceit_drake.hardware.hardware_config import (
     differing,
     load_hardware_config,
 )
+from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.robot_run.operated_robot import OperatedRobot, ask, plan_text
@@ -463,6 +464,28 @@ def test_a_motion_that_ends_without_a_confirmed_stop_is_no_success(
     assert "complete, but the robot has not confirmed" in made.stopped
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text())["stopped"] == made.stopped
+
+
+def test_an_error_in_the_diagram_stops_the_robot_and_keeps_the_record(
+    robot, monkeypatch, capsys, tmp_path
+):
+    send, sent = RtdeSystem.send, []
+
+    def broken(system, context):
+        sent.append(1)
+        if len(sent) > 20:
+            raise ValueError("the policy decides nan")
+        send(system, context)
+
+    monkeypatch.setattr(RtdeSystem, "send", broken)
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    made = checked_run(robot, tmp_path, 2.0)
+    assert made.stopped == "ValueError: the policy decides nan"
+    assert robot.stopped.is_set()
+    printed = capsys.readouterr()
+    assert "STOPPED: ValueError: the policy decides nan" in printed.out
+    assert "robot's program is stopped" in printed.out and "in broken" in printed.err
+    assert {"record.csv", "robot.csv", "summary.json"} <= {file.name for file in tmp_path.iterdir()}
 
 
 def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):

@@ -74,6 +74,7 @@ class HardwareRun:
         run: Diagram and results, once it ran.
         link: Link to the robot, once it ran.
         stop: Why the robot stopped, once it ran.
+        error: What the run ended by, if that was an error; for who wrote a policy or a system.
     """
 
     scenario: Scenario
@@ -85,6 +86,7 @@ class HardwareRun:
     run: Run | None = None
     link: RobotLink | None = None
     stop: Stop | None = None
+    error: Exception | None = None
 
     @property
     def motion(self) -> Motion:
@@ -149,6 +151,9 @@ class HardwareRun:
     ) -> Run:
         """Runs the scenario to its end, or to the first fault; always stops the robot's program.
 
+        An error in the diagram, such as a policy's, is a fault like any other: it ends the run, and
+        what was measured up to there is kept.
+
         Args:
             duration: Duration, s; None for the motion's.
             progress: Called with run time and wall time, s, now and then.
@@ -172,6 +177,11 @@ class HardwareRun:
             if self.run is None:
                 raise
             self.run.stopped = reason
+        except Exception as error:
+            if self.run is None:
+                raise
+            self.error = error
+            reason = self.run.stopped = f"{type(error).__name__}: {error}"
         finally:
             stop = self.stop = link.finish(reason)
         if stop.limit != "end":

@@ -8,6 +8,7 @@ import sys
 import termios
 import threading
 import time as clock
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -374,6 +375,8 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
         print(_stopped_text(hardware.link), flush=True)
+    if hardware.error is not None:
+        traceback.print_exception(hardware.error)
     numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     try:
         with handle_signals(numbers, lambda *_: print("Still writing the record.", flush=True)):
