@@ -5,8 +5,17 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["catch_signals", "handle_signals", "raise_if_interrupted"]
+__all__ = [
+    "ENDING",
+    "catch_signals",
+    "handle_signals",
+    "interrupted_once",
+    "raise_if_interrupted",
+    "uninterrupted",
+]
 
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What asks a program to end: Ctrl-C, who ends a process, and a terminal that is closed."""
 _asked = threading.Event()
 
 
@@ -37,10 +46,36 @@ def catch_signals() -> Iterator[None]:
     """
     _asked.clear()
     try:
-        with handle_signals((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), _interrupt):
+        with handle_signals(ENDING, _interrupt):
             yield
     finally:
         _asked.clear()
+
+
+@contextmanager
+def interrupted_once() -> Iterator[None]:
+    """Lets only the first signal interrupt what moves a robot, within `catch_signals`.
+
+    What follows the first, stopping the robot and keeping its record, is not left half done for a
+    user who presses Ctrl-C again, or a terminal that sends two signals when it is closed.
+    """
+
+    def interrupt(*_: object) -> None:
+        if not _asked.is_set():
+            _interrupt()
+
+    with handle_signals(ENDING, interrupt):
+        yield
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Lets no signal keep a robot from being stopped; it is noted, see `raise_if_interrupted`.
+
+    For what ends by itself within seconds.
+    """
+    with handle_signals(ENDING, lambda *_: _asked.set()):
+        yield
 
 
 def raise_if_interrupted() -> None:

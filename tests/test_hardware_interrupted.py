@@ -104,6 +104,18 @@ def test_a_robot_that_is_not_moved_is_left_without_a_program(typed, emulator):
         wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
 
 
+@pytest.mark.parametrize("pause", [0.003, 0.01])
+def test_signals_in_a_row_at_the_question_stop_the_robots_program(pause, emulator):
+    with hardware(emulator, "--move-to-start") as process:
+        read_until(process, 'Type "move"')
+        for _ in range(4):
+            process.send_signal(signal.SIGINT)
+            time.sleep(pause)
+        printed = process.stdout.read()
+        assert process.wait(30.0) == 130, printed
+        assert emulator.pendant.status()["runtime_state"] == "STOPPED"
+
+
 def test_a_program_that_runs_on_the_robot_is_not_replaced(emulator):
     with hardware(emulator, "--move-to-start") as first:
         read_until(first, 'Type "move"')

@@ -33,6 +33,7 @@ from sliceit_drake.hardware.hardware_config import (
     load_hardware_config,
 )
 from sliceit_drake.hardware.rtde_system import RtdeSystem
+from sliceit_drake.interruption import catch_signals
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.robot_run.operated_robot import OperatedRobot, ask, plan_text
@@ -309,7 +310,31 @@ def test_a_run_that_is_interrupted_again_and_again_keeps_its_log(
         operated.checked_run(hardware, tmp_path, 2.0)
     monkeypatch.undo()
     assert "STOPPED: interrupted by the user, more than once" in capsys.readouterr().out
-    assert (tmp_path / "robot.csv").exists() and robot.stopped.wait(2.0)
+    assert robot.stopped.wait(2.0)
+    assert {"record.csv", "robot.csv", "summary.json"} <= {file.name for file in tmp_path.iterdir()}
+
+
+def test_signals_in_a_row_cut_neither_the_stop_nor_the_record_short(
+    robot, monkeypatch, capsys, tmp_path
+):
+    def stop():
+        clock.sleep(0.5)
+        raise RuntimeError("no answer")
+
+    def press_again_and_again():
+        for number in (signal.SIGINT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM) * 2:
+            os.kill(os.getpid(), number)
+            clock.sleep(0.05)
+
+    robot.stop = stop
+    robot.later(0.6, lambda: threading.Thread(target=press_again_and_again).start())
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    with catch_signals():
+        made = checked_run(robot, tmp_path, 2.0)
+    assert made.stopped.startswith("interrupted by the user")
+    # The robot's answer was waited for.
+    assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
+    assert {"record.csv", "robot.csv", "summary.json"} <= {file.name for file in tmp_path.iterdir()}
 
 
 def test_a_contact_after_zeroing_is_found_before_it_moves(robot, monkeypatch, capsys, tmp_path):

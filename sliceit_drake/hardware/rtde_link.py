@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from sliceit_drake.hardware.client import RobotClient, RobotState, RobotUnavailableError
 from sliceit_drake.hardware.safety import SafetyLayer, Stop
+from sliceit_drake.interruption import uninterrupted
 
 __all__ = ["LinkStatus", "RobotLink"]
 
@@ -194,17 +195,24 @@ class RobotLink:
                 clock.sleep(0.005)
                 stop = self._safety.stop or stop
         finally:
-            # Also for an operator who presses Ctrl-C again, because it does not brake at once.
-            self._ending = True
-            self._halt()
-        self._thread.join(STOP_TIME)
-        if self._halt_thread is not None:
-            # A dead link makes the library wait for minutes; the watchdog has stopped the robot.
-            patience = HALT_TIME / max(self._pace, SLOWEST)
-            self._halt_thread.join(patience)
-            if self._halt_thread.is_alive():
-                self.stop_error = f"it did not answer for {patience:g} s"
+            # Also for an operator who presses Ctrl-C again, because it does not brake at once. Only
+            # after this is known whether the robot has stopped: no signal shortens it.
+            with uninterrupted():
+                self._ending = True
+                self._halt()
+                self._thread.join(STOP_TIME)
+                self._await_halt()
         return self._safety.stop or stop
+
+    def _await_halt(self) -> None:
+        """Waits for the robot's answer to `_halt`, and notes if there is none."""
+        if self._halt_thread is None:
+            return
+        # A dead link makes the library wait for minutes; the watchdog has stopped the robot.
+        patience = HALT_TIME / max(self._pace, SLOWEST)
+        self._halt_thread.join(patience)
+        if self._halt_thread.is_alive():
+            self.stop_error = f"it did not answer for {patience:g} s"
 
     def way(self) -> list[list[float]]:
         """Measured joints [n, 6], rad, from the first target on; after `finish`."""

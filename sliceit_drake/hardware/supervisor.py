@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 
 from sliceit_drake.hardware.client import RobotUnavailableError
+from sliceit_drake.interruption import uninterrupted
 
 __all__ = ["Supervisor", "stop_by_dashboard"]
 
@@ -96,6 +97,10 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         Raises:
             RobotUnavailableError: It has not confirmed that one either.
         """
+        with uninterrupted():
+            self._end()
+
+    def _end(self) -> None:
         self._is_over.set()
         if self._beats.ident is not None:
             self._beats.join()

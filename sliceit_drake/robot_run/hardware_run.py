@@ -46,6 +46,7 @@ from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = [
+    "INTERRUPTED",
     "NO_DATA",
     "HardwareRun",
     "prepare_hardware_run",
@@ -53,6 +54,8 @@ __all__ = [
     "write_hardware_outputs",
 ]
 
+INTERRUPTED = "interrupted by the user"
+"""Why a run stopped that Ctrl-C or another signal ended."""
 SENSOR_SAMPLES = 50
 WARM_UP = 0.05
 """Simulated in another context before the run, s."""
@@ -173,7 +176,7 @@ class HardwareRun:
                 self._follow(run, station, duration or run.motion.duration, progress, moves)
             reason = run.stopped or "the motion is complete"
         except KeyboardInterrupt:
-            reason = "interrupted by the user"
+            reason = INTERRUPTED
             if self.run is None:
                 raise
             self.run.stopped = reason

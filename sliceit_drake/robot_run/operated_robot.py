@@ -1,5 +1,6 @@
 """A robot whose motions an operator confirms: connect, check, show, ask for the word, move."""
 
+import contextlib
 import dataclasses as dc
 import os
 import shutil
@@ -25,9 +26,16 @@ from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
 from sliceit_drake.hardware.real_time import RealTime
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.supervisor import Supervisor
-from sliceit_drake.interruption import catch_signals, handle_signals
+from sliceit_drake.interruption import (
+    ENDING,
+    catch_signals,
+    handle_signals,
+    interrupted_once,
+    uninterrupted,
+)
 from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
 from sliceit_drake.robot_run.hardware_run import (
+    INTERRUPTED,
     HardwareRun,
     prepare_hardware_run,
     write_hardware_outputs,
@@ -279,8 +287,10 @@ class OperatedRobot:
                 self._connection = client, supervisor
                 yield client
             finally:
-                self._connection = None
-                client.close()
+                # A second signal would leave the program playing, and ur_rtde's threads alive.
+                with uninterrupted():
+                    self._connection = None
+                    client.close()
 
 
 class _Watch(threading.Thread):
@@ -354,7 +364,25 @@ def _room(directory: Path) -> Check:
 
 
 def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
-    """Runs, writes and reports."""
+    """Runs, tells the operator how it ended, and writes what was measured, whatever ended it."""
+    with interrupted_once():
+        try:
+            made = _executed(hardware, duration)
+        except KeyboardInterrupt:
+            if hardware.run is not None:
+                again = ", more than once" if hardware.run.stopped == INTERRUPTED else ""
+                hardware.run.stopped = (hardware.run.stopped or INTERRUPTED) + again
+            raise
+        finally:
+            # What was not prepared has sent nothing, and has no record.
+            if hardware.run is not None and hardware.link is not None:
+                with handle_signals(ENDING, _say_still_writing):
+                    _tell_and_write(hardware, hardware.run, directory)
+    return made
+
+
+def _executed(hardware: HardwareRun, duration: float) -> Run:
+    """Runs, and shows how far it is."""
     from tqdm import tqdm
 
     with tqdm(
@@ -366,21 +394,19 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
         def show(time: float, wall: float) -> None:
             bar.update(time - bar.n)
 
-        try:
-            made = hardware.execute(duration, show)
-        except KeyboardInterrupt:
-            _keep_log(hardware, directory)
-            raise
-    # Before any file: a full disk, or a record that takes long, must not keep it from the operator.
+        return hardware.execute(duration, show)
+
+
+def _tell_and_write(hardware: HardwareRun, made: Run, directory: Path) -> None:
+    """Says first how a run has ended: a full disk, or a record that takes long, must not keep that
+    from the operator."""
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
         print(_stopped_text(hardware.link), flush=True)
     if hardware.error is not None:
         traceback.print_exception(hardware.error)
-    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     try:
-        with handle_signals(numbers, lambda *_: print("Still writing the record.", flush=True)):
-            summary = write_hardware_outputs(hardware, directory)
+        summary = write_hardware_outputs(hardware, directory)
     except OSError as error:
         print(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
         raise
@@ -390,17 +416,12 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
         f"{robot['missed_cycles']:.0f} missed, lateness {1e3 * robot['lateness_99_s']:.2f} ms "
         f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
     )
-    return made
 
 
-def _keep_log(hardware: HardwareRun, directory: Path) -> None:
-    """What is left of a run that was interrupted again while it stopped; not to be interrupted."""
-    with handle_signals((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), lambda *_: None):
-        print("STOPPED: interrupted by the user, more than once")
-        print(_stopped_text(hardware.link), flush=True)
-        if hardware.link is not None:
-            directory.mkdir(parents=True, exist_ok=True)
-            hardware.link.write_log(directory / "robot.csv")
+def _say_still_writing(*_: object) -> None:
+    # Python refuses to print where the signal came in the middle of a print.
+    with contextlib.suppress(RuntimeError):
+        print("Still writing the record.", flush=True)
 
 
 def ask(word: str, is_emulated: bool) -> bool:
