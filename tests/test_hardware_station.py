@@ -1,6 +1,7 @@
 """The hardware station on a fake robot: the simulated station's ports, plan, checks and outputs."""
 
 import argparse
+import contextlib
 import dataclasses as dc
 import errno
 import io
@@ -335,6 +336,42 @@ def test_signals_in_a_row_cut_neither_the_stop_nor_the_record_short(
     # The robot's answer was waited for.
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
     assert {"record.csv", "robot.csv", "summary.json"} <= {file.name for file in tmp_path.iterdir()}
+
+
+class GoneTerminal(io.StringIO):
+    """A terminal that is closed, or a reader that leaves, once the motion is shown."""
+
+    is_gone = False
+
+    def write(self, text):
+        if self.is_gone:
+            raise OSError(errno.EIO, "Input/output error")
+        return super().write(text)
+
+
+@pytest.mark.parametrize("is_told", [True, False], ids=["by a signal", "by the bar alone"])
+def test_a_closed_terminal_ends_the_motion_and_leaves_the_whole_record(
+    is_told, robot, monkeypatch, tmp_path
+):
+    terminals = GoneTerminal(), GoneTerminal()
+
+    def close():
+        for terminal in terminals:
+            terminal.is_gone = True
+        if is_told:
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    monkeypatch.setattr("sys.stdout", terminals[0])
+    monkeypatch.setattr("sys.stderr", terminals[1])
+    robot.later(0.6, close)
+    with catch_signals(), contextlib.suppress(OSError):
+        checked_run(robot, tmp_path, 2.0)
+    assert robot.stopped.is_set()
+    names = {"record.csv", "robot.csv", "summary.json"}
+    assert names <= {file.name for file in tmp_path.iterdir()}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["stopped"] and len(robot.sent) > 5
 
 
 def test_a_contact_after_zeroing_is_found_before_it_moves(robot, monkeypatch, capsys, tmp_path):

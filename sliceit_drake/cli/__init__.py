@@ -1,5 +1,6 @@
 """The program `sliceit`: each command parses its arguments, calls its package, and prints."""
 
+import contextlib
 import os
 import sys
 
@@ -23,7 +24,8 @@ def ended(status: int) -> int:
     """
     client = sys.modules.get("sliceit_drake.hardware.ur_client")
     if client is not None and client.LOST:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):  # Who read it may have left.
+                stream.flush()
         os._exit(status)
     return status

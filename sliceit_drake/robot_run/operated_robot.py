@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Self, TextIO
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.live_view import make_meshcat
@@ -139,8 +139,10 @@ class OperatedRobot:
             try:
                 problem = retreat.execute()
             finally:
-                print(f"STOPPED: {problem}" if problem else "The knife is back.")
-                print(_stopped_text(retreat.link), flush=True)
+                _tell(
+                    f"STOPPED: {problem}" if problem else "The knife is back.",
+                    _stopped_text(retreat.link),
+                )
                 retreat.link.write_log(directory / "retreat.csv")
             return problem is None
 
@@ -401,17 +403,16 @@ def _tell_and_write(hardware: HardwareRun, made: Run, directory: Path) -> None:
     """Says first how a run has ended: a full disk, or a record that takes long, must not keep that
     from the operator."""
     if made.stopped:
-        print(f"STOPPED: {made.stopped}")
-        print(_stopped_text(hardware.link), flush=True)
+        _tell(f"STOPPED: {made.stopped}", _stopped_text(hardware.link))
     if hardware.error is not None:
-        traceback.print_exception(hardware.error)
+        _tell("".join(traceback.format_exception(hardware.error)), file=sys.stderr)
     try:
         summary = write_hardware_outputs(hardware, directory)
     except OSError as error:
-        print(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
+        _tell(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
         raise
     robot = summary["robot"]
-    print(
+    _tell(
         f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
         f"{robot['missed_cycles']:.0f} missed, lateness {1e3 * robot['lateness_99_s']:.2f} ms "
         f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
@@ -421,7 +422,17 @@ def _tell_and_write(hardware: HardwareRun, made: Run, directory: Path) -> None:
 def _say_still_writing(*_: object) -> None:
     # Python refuses to print where the signal came in the middle of a print.
     with contextlib.suppress(RuntimeError):
-        print("Still writing the record.", flush=True)
+        _tell("Still writing the record.")
+
+
+def _tell(*lines: str, file: TextIO | None = None) -> None:
+    """Prints to an operator who may have left: what was measured is kept all the same.
+
+    A reader who leaves ends the motion, by the error of the progress bar; a closed terminal does by
+    its signal.
+    """
+    with contextlib.suppress(OSError):
+        print("\n".join(lines), file=file, flush=True)
 
 
 def ask(word: str, is_emulated: bool) -> bool:
