@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["check_folder", "check_output", "remove_results", "results_in"]
+__all__ = ["check_folder", "check_output", "remove_results", "results_in", "set_aside", "unused"]
 
 RESULTS = (
     "replay.html",
@@ -46,6 +46,34 @@ def remove_results(folder: Path) -> None:
             file.unlink()
     if series.is_dir() and not any(series.iterdir()):
         series.rmdir()
+
+
+def set_aside(folder: Path) -> None:
+    """Moves what earlier runs wrote to a folder into a new one in it: earlier, earlier_2 and so on.
+
+    What a robot has measured is not removed: no command makes it again.
+    """
+    names = [name for name in (*RESULTS, "paraview") if (folder / name).exists()]
+    if not names:
+        return
+    earlier = unused(folder / "earlier")
+    earlier.mkdir()
+    for name in names:
+        (folder / name).rename(earlier / name)
+
+
+def unused(path: Path, *suffixes: str) -> Path:
+    """A path that nothing has: this one, or else with _2, _3 and so on at its end.
+
+    Args:
+        path: The first to try, without suffix.
+        suffixes: Of the files that will be written by that name; none for a folder.
+    """
+    free, number = path, 1
+    while any(free.with_name(free.name + suffix).exists() for suffix in suffixes or ("",)):
+        number += 1
+        free = path.with_name(f"{path.name}_{number}")
+    return free
 
 
 def check_folder(folder: Path, field: str) -> None:

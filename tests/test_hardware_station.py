@@ -35,6 +35,7 @@ from sliceit_drake.hardware.hardware_config import (
 )
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.interruption import catch_signals
+from sliceit_drake.output_folder import unused
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.robot_run.operated_robot import OperatedRobot, ask, plan_text
@@ -261,6 +262,29 @@ def test_with_a_full_disk_the_operator_reads_of_the_stop_and_has_the_log(
     assert printed.index("STOPPED: safety_status") < printed.index("NOT ALL IS WRITTEN")
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in printed
     assert len((tmp_path / "robot.csv").read_text().splitlines()) > 50
+
+
+def test_a_run_leaves_the_records_of_the_runs_before(robot, monkeypatch, tmp_path):
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n" * 3))
+    (tmp_path / "notes.txt").write_text("mine")
+    checked_run(robot, tmp_path)
+    first = (tmp_path / "robot.csv").read_text()
+    (tmp_path / "record.csv").unlink()  # As after a full disk.
+    robot.payload = (1.2, 0.0, 0.0, 0.07)
+    assert "centre" in checked_run(robot, tmp_path).stopped, "it is not ready"
+    second = (tmp_path / "robot.csv").read_text()
+    assert checked_run(robot, tmp_path).stopped
+    assert (tmp_path / "earlier" / "robot.csv").read_text() == first
+    assert (tmp_path / "earlier_2" / "robot.csv").read_text() == second
+    assert (tmp_path / "record.csv").exists() and (tmp_path / "notes.txt").exists()
+
+
+def test_the_records_of_stopped_slices_of_a_protocol_are_all_kept(tmp_path):
+    for name in ("slice_000_stopped.csv", "slice_000_stopped_2.yaml"):
+        (tmp_path / name).touch()
+    free = unused(tmp_path / "slice_000_stopped", ".csv", ".yaml")
+    assert free == tmp_path / "slice_000_stopped_3"
+    assert unused(tmp_path / "slice_001_stopped", ".csv", ".yaml").name == "slice_001_stopped"
 
 
 def test_without_room_for_the_record_nothing_moves(robot, monkeypatch, capsys, tmp_path):

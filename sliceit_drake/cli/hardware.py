@@ -16,6 +16,7 @@ Writes to DIR what `sliceit simulate` writes, and
   robot.csv          what came from the robot and what was sent, in every cycle
   retreat.csv        the same of a retreat
   slice.csv, .yaml   the slice record, for `sliceit records` and `sliceit diagnose`
+What earlier runs wrote there is moved to DIR/earlier, DIR/earlier_2 and so on.
 
 --robot names the file with your robot's payload, board height and limits. Copy hardware/ur5e.yaml.
 """

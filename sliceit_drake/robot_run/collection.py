@@ -10,6 +10,7 @@ import numpy as np
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.run import Run, prepare_run
 from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.output_folder import unused
 from sliceit_drake.records.metadata import slice_name
 from sliceit_drake.records.slice_record import write_record
 from sliceit_drake.robot_run.operated_robot import OperatedRobot
@@ -112,9 +113,11 @@ class Collection:
         record = slice_record_of(
             made, provenance, index=specimen.index, condition=specimen.condition.label
         )
-        # A slice that ended early does not count as cut.
-        name = slice_name(specimen.index) + ("_stopped" if made.stopped else "")
-        write_record(record, self.directory / name)
+        file = self.directory / slice_name(specimen.index)
+        if made.stopped:
+            # A slice that ended early does not count as cut; several may.
+            file = unused(self.directory / f"{file.name}_stopped", ".csv", ".yaml")
+        write_record(record, file)
 
 
 def _what(condition: Condition) -> str:

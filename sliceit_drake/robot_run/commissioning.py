@@ -17,6 +17,7 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.hardware.client import PLAYING, RobotClient
 from sliceit_drake.hardware.readings import pose_difference
 from sliceit_drake.interruption import raise_if_interrupted
+from sliceit_drake.output_folder import unused
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 from sliceit_drake.robot_run.operated_robot import OperatedRobot
 
@@ -119,8 +120,12 @@ class Commissioning:
         ]
 
     def walk(self) -> bool:
-        """Walks; whether all steps passed. The record is written after each."""
+        """Walks; whether all steps passed. The record is written after each; an earlier one is
+        kept by another name."""
         self._directory.mkdir(parents=True, exist_ok=True)
+        if (self._directory / RECORD).exists():
+            earlier = unused(self._directory / "commissioning_earlier", ".json")
+            (self._directory / RECORD).rename(earlier.with_suffix(".json"))
         rows: list[dict] = []
         for number, (name, see, run) in enumerate(self._steps, 1):
             print(f"\nSTEP {number} of {len(self._steps)}, {name}. {see}\n", flush=True)

@@ -39,7 +39,7 @@ from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.safety import Stop
 from sliceit_drake.interruption import raise_if_interrupted
-from sliceit_drake.output_folder import remove_results
+from sliceit_drake.output_folder import set_aside
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.systems.agent import AgentSystem
 from sliceit_drake.systems.motion_sources import placed_motion
@@ -300,7 +300,7 @@ def prepare_hardware_run(
 
 
 def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
-    """Writes the files of `Run.save` from what the robot measured.
+    """Writes the files of `Run.save` from what the robot measured; what is there is set aside.
 
     And robot.csv: what came and what went out in every cycle, braking included; `robot` in the
     summary has the timing. The replay shows the measured motion; the food in it is not cut.
@@ -311,7 +311,7 @@ def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
     run, link = hardware.run, hardware.link
     assert run is not None and link is not None, "execute first"
     directory.mkdir(parents=True, exist_ok=True)
-    remove_results(directory)
+    set_aside(directory)
     link.write_log(directory / "robot.csv")  # First: what comes later needs more time and room.
     meshcat = hardware.twin.meshcat
     if meshcat is not None:
