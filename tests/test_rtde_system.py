@@ -148,6 +148,24 @@ def test_a_diagram_that_comes_late_stops_the_robot(robot):
     link.finish("test over")
 
 
+def test_a_hold_that_nobody_ends_stops_the_robots_program(robot, monkeypatch):
+    monkeypatch.setattr("sliceit_drake.hardware.rtde_link.HOLD_TIME", 0.05)
+    link, told = make_link(robot), []
+    link.abandoned = told.append
+    link.start()
+    link.arm()
+    stream(link, 0.05)
+    # As in a policy that never returns: `finish` is not called.
+    assert robot.stopped.wait(20.0), "the arm is held for ever"
+    robot.wait(0.02)
+    sent = len(robot.sent)
+    robot.wait(0.05)
+    assert len(robot.sent) == sent and robot.log.count("stop") == 1
+    assert [stop.limit for stop in told] == ["command_age"]
+    stop = link.finish("test over")
+    assert (stop.limit, stop.sends) == ("command_age", False)
+
+
 def test_nothing_is_late_before_the_first_command(robot):
     link = make_link(robot)
     link.start()

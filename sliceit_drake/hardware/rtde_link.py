@@ -7,7 +7,7 @@ import csv
 import math
 import threading
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +30,8 @@ HALT_TIME = 3.0
 """How long the robot may take to end its program, s."""
 LATENESS = (1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
 """Bounds of the histogram of lateness, s."""
+HOLD_TIME = 1.0
+"""How long a latched arm is held at rest for who does not `finish`, controller s."""
 SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
@@ -81,6 +83,9 @@ class RobotLink:
     refused, fails or takes long: traces of a link that came back, and of a program that was
     uploaded anew. After such a fault nothing is sent again.
 
+    A breach of a limit is held at rest for `HOLD_TIME` at most. If nobody has called `finish` by
+    then, as after a policy that never returns, the thread stops the robot's program itself.
+
     Args:
         client: Connected.
         safety: Not armed yet.
@@ -90,6 +95,7 @@ class RobotLink:
 
     Attributes:
         stop_error: What the client said when it could not stop the robot's program, or None.
+        abandoned: Called with the stop, from the thread, if a hold ends that way.
     """
 
     def __init__(
@@ -109,6 +115,8 @@ class RobotLink:
         self._halted = False
         self._halt_thread: threading.Thread | None = None
         self.stop_error: str | None = None
+        self.abandoned: Callable[[Stop], None] | None = None
+        self._held_since = math.inf
         self._thread = threading.Thread(target=self._guarded, name="robot link", daemon=True)
 
     def start(self) -> LinkStatus:
@@ -335,6 +343,11 @@ class RobotLink:
             decision = safety.step(state, command.q if command and is_new else None, answered)
         if command is not None and is_new:
             self._judged = command.number
+        if decision.stop is not None and safety.is_still and self._is_held_too_long(state.time):
+            self._latch_fault("hold", "nobody ends the run")  # The first stop stays the reason.
+            if self.abandoned is not None:
+                self.abandoned(decision.stop)
+            return False
         if decision.q is None:
             if decision.stop is not None:
                 self._halt()
@@ -351,6 +364,11 @@ class RobotLink:
         elif took > SLOW_CALL / self._pace:
             self._latch_fault("link", f"sending a target took {took:.3g} s: the link reconnected")
         return True
+
+    def _is_held_too_long(self, time: float) -> bool:
+        """Whether a latched arm was held at rest for longer than it takes to end a run."""
+        self._held_since = min(self._held_since, time)
+        return time - self._held_since > HOLD_TIME and not self._ending and not self._halted
 
     def _latch_fault(self, limit: str, detail: str) -> None:
         with self._changed:

@@ -77,6 +77,8 @@ class HardwareRun:
         run: Diagram and results, once it ran.
         link: Link to the robot, once it ran.
         stop: Why the robot stopped, once it ran.
+        abandoned: Called from the link's thread if the diagram does not come back after a stop; see
+            `RobotLink`.
         error: What the run ended by, if that was an error; for who wrote a policy or a system.
     """
 
@@ -89,6 +91,7 @@ class HardwareRun:
     run: Run | None = None
     link: RobotLink | None = None
     stop: Stop | None = None
+    abandoned: Callable[[Stop], None] | None = None
     error: Exception | None = None
 
     @property
@@ -168,6 +171,7 @@ class HardwareRun:
         robot = RobotConnection(self.client, self.config, self.pace, self.twin)
         station = MakeStation(self.scenario, hardware=robot)
         link = self.link = station.link
+        link.abandoned = self.abandoned
         link.start()
         reason = "the program ended by an error"
         try:

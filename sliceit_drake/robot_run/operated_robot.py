@@ -25,6 +25,7 @@ from sliceit_drake.hardware.guarded_touch import Touch, TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
 from sliceit_drake.hardware.real_time import RealTime
 from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.hardware.safety import Stop
 from sliceit_drake.hardware.supervisor import Supervisor
 from sliceit_drake.interruption import (
     ENDING,
@@ -367,6 +368,7 @@ def _room(directory: Path) -> Check:
 
 def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
     """Runs, tells the operator how it ended, and writes what was measured, whatever ended it."""
+    hardware.abandoned = _end_a_diagram_that_stands
     with interrupted_once():
         try:
             made = _executed(hardware, duration)
@@ -381,6 +383,16 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
                 with handle_signals(ENDING, _say_still_writing):
                     _tell_and_write(hardware, hardware.run, directory)
     return made
+
+
+def _end_a_diagram_that_stands(stop: Stop) -> None:
+    """Tells the operator of a stop that the diagram does not come back to see; interrupts it."""
+    _tell(
+        f"STOPPED: {stop}. The program waits for it still, and is interrupted; the robot's program "
+        "is being stopped. If nothing follows, use the emergency stop before you go near it.",
+        file=sys.stderr,
+    )
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 def _executed(hardware: HardwareRun, duration: float) -> Run:
