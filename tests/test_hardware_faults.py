@@ -13,6 +13,7 @@ from emulator_bench import wait_until
 from hardware_bench import emulated, run_hardware
 
 from sliceit_drake.resources import resource_path
+from sliceit_drake.robot_run.hardware_run import HardwareRun
 
 pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
@@ -103,3 +104,21 @@ def test_refused_connections_matter_only_to_who_connects_anew(
         assert code == 0, printed
     else:
         assert code == 1 and re.search(said, printed), printed
+
+
+def test_a_dry_run_in_which_the_robot_stops_ends_without_success(tmp_path, monkeypatch, capsys):
+    with emulated(SPRING, OVERRIDES) as emulator:
+        prepare = HardwareRun._prepare
+
+        def then_stop(hardware, station):
+            made = prepare(hardware, station)
+            emulator.pendant.inject("emergency_stop")
+            return made
+
+        monkeypatch.setattr(HardwareRun, "_prepare", then_stop)
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, [], "--dry-run", scenario=SPRING,
+            overrides=OVERRIDES, pace=0.05,
+        )  # fmt: skip
+    printed = capsys.readouterr().out
+    assert code == 1 and "NOT READY: safety_status" in printed, printed

@@ -132,6 +132,35 @@ def test_the_same_wrench_is_shown_at_the_knife_in_the_world(robot):
     assert robot.sent == [] and robot.watchdog is None, "a dry run sends nothing"
 
 
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ({"bits": 1 << 6 | 1 << 7 | 1 << 10}, "safety_status"),
+        ({"runtime": 1}, "program is stopped"),
+        ({"wrench": [np.nan] * 6}, "no 6 finite numbers"),
+        ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "meets a force"),
+    ],
+    ids=["safety", "program", "nan", "force"],
+)
+def test_a_dry_run_ends_without_success_at_what_would_stop_a_run(
+    fault, said, robot, capsys, tmp_path
+):
+    hardware = hardware_run(robot)
+
+    def fail():
+        for name, value in fault.items():
+            setattr(robot, name, value)
+
+    prepare = hardware._prepare
+    hardware._prepare = lambda station: (prepare(station), robot.later(0.1, fail))[0]
+    made = OperatedRobot(EMULATED, hardware.config, PACE, dry_run=True).checked_run(
+        hardware, tmp_path
+    )
+    assert said in made.stopped and robot.sent == []
+    printed = capsys.readouterr().out
+    assert f"NOT READY: {made.stopped}" in printed and "robot's program is stopped" in printed
+
+
 def test_a_fault_ends_the_run_with_its_reason_and_keeps_the_record(robot, tmp_path):
     hardware = hardware_run(robot)
 

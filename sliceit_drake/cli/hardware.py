@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
     if made is None:
         return 1
     if options.dry_run:
-        return 0
+        return 1 if made.stopped else 0
     write_record(slice_record_of(made, "UR5e through RTDE."), directory / "slice")
     print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
     return 1 if made.stopped else 0

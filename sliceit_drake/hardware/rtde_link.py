@@ -156,6 +156,10 @@ class RobotLink:
             self._command, self._armed = None, stop is None
         return stop
 
+    def look(self, state: RobotState) -> Stop | None:
+        """What a state says against the robot, where nothing is sent to it."""
+        return self._safety.look(state)
+
     def latest(self) -> LinkStatus:
         """The newest status."""
         assert self._status is not None, "start() first"

@@ -187,6 +187,10 @@ class SafetyLayer:
         self._armed = True
         return None
 
+    def look(self, state: RobotState) -> Stop | None:
+        """What a state alone says against a robot to which nothing is sent; latches nothing."""
+        return robot_fault(state) or self._measurement_fault(state)
+
     def latch(
         self,
         limit: str,

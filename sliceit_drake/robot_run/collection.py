@@ -75,7 +75,7 @@ class Collection:
             if made is None:
                 return False
             if is_dry:
-                return True
+                return not made.stopped
             self._write(made, specimen)
             if made.stopped:
                 print(f"Stopped: {made.stopped}. Its record is kept. Start again to go on.")

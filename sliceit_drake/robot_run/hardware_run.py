@@ -252,6 +252,11 @@ class HardwareRun:
                 return
             if not is_new:
                 continue
+            # While it sends, the link's thread looks itself.
+            fault = None if moves else link.look(status.state)
+            if fault is not None:
+                run.stopped = str(fault)
+                return
             simulator.AdvanceTo(now)
             outcome = simulator.AdvancePendingEvents()
             if moves:

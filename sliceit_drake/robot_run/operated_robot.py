@@ -237,6 +237,9 @@ class OperatedRobot:
             assert hardware.link is not None
             timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
             print(f"Dry run: nothing was sent to the joints. {timing}")
+            if made.stopped:
+                print(f"NOT READY: {made.stopped}")
+                print(_stopped_text(hardware.link))
             return made
         return _slice(hardware, duration, directory) if self.asks(WORD) else None
 
