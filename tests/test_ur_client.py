@@ -8,7 +8,7 @@ import pytest
 from emulator_bench import free_address
 
 from sliceit_drake.emulator.process import EmulatorProcess
-from sliceit_drake.hardware.client import RUNTIME_STATES
+from sliceit_drake.hardware.client import RUNTIME_STATES, RobotUnavailableError
 from sliceit_drake.hardware.rtde_link import HALT_TIME
 from sliceit_drake.hardware.supervisor import Supervisor
 from sliceit_drake.hardware.ur_client import ATTEMPT, UrClient
@@ -148,3 +148,17 @@ def test_ctrl_c_while_control_is_taken_stops_the_program(monkeypatch):
         status = emulator.pendant.status()
     assert any(text.startswith("program started") for _, text in status["log"])
     assert status["runtime_state"] == "STOPPED"
+
+
+def test_a_paused_program_of_somebody_else_is_not_replaced():
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        theirs = UrClient(emulator.address, 0.03, 2000.0)
+        try:
+            emulator.pendant.inject("program_paused")
+            with pytest.raises(RobotUnavailableError, match="runs on the robot, or is paused"):
+                UrClient(emulator.address, 0.03, 2000.0)
+            status = emulator.pendant.status()
+            assert status["runtime_state"] == "PAUSED"
+            assert not any("replaced" in text for _, text in status["log"])
+        finally:
+            theirs.close()

@@ -138,13 +138,14 @@ class UrClient:
                 )
 
     def _refuse_running_program(self) -> None:
-        # Taking control would replace it, and stop a robot that works for somebody else.
+        # Taking control would replace it, and stop a robot that works for somebody else. One that
+        # is paused would be lost as well.
         deadline = time.monotonic() + self._stop_time
-        while self._dashboard.running():
+        while not self._has_ended():
             if time.monotonic() > deadline:
                 raise RobotUnavailableError(
-                    f"{self._host}: a program runs on the robot. Whosever it is: stop it on the "
-                    "pendant, and start again."
+                    f"{self._host}: a program runs on the robot, or is paused. Whosever it is: "
+                    "stop it on the pendant, and start again."
                 )
             time.sleep(0.05)
 
