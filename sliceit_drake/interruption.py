@@ -9,6 +9,7 @@ __all__ = [
     "ENDING",
     "catch_signals",
     "handle_signals",
+    "interrupt_main_thread",
     "interrupted_once",
     "raise_if_interrupted",
     "uninterrupted",
@@ -76,6 +77,16 @@ def uninterrupted() -> Iterator[None]:
     """
     with handle_signals(ENDING, lambda *_: _asked.set()):
         yield
+
+
+def interrupt_main_thread() -> None:
+    """Sends Ctrl-C from another thread to the main one.
+
+    A signal to the whole process may come to any thread, and not end what the main one waits for.
+    """
+    main = threading.main_thread().ident
+    assert main is not None
+    signal.pthread_kill(main, signal.SIGINT)
 
 
 def raise_if_interrupted() -> None:

@@ -2,9 +2,7 @@
 
 import contextlib
 import dataclasses as dc
-import os
 import shutil
-import signal
 import sys
 import termios
 import threading
@@ -31,6 +29,7 @@ from sliceit_drake.interruption import (
     ENDING,
     catch_signals,
     handle_signals,
+    interrupt_main_thread,
     interrupted_once,
     uninterrupted,
 )
@@ -336,7 +335,7 @@ class _Watch(threading.Thread):
                 except RuntimeError as error:
                     problem += f" {_not_stopped_text(str(error))}"
             self.problem = problem
-            os.kill(os.getpid(), signal.SIGINT)
+            interrupt_main_thread()
             return
 
 
@@ -395,7 +394,7 @@ def _end_a_diagram_that_stands(stop: Stop) -> None:
         "is being stopped. If nothing follows, use the emergency stop before you go near it.",
         file=sys.stderr,
     )
-    os.kill(os.getpid(), signal.SIGINT)
+    interrupt_main_thread()
 
 
 def _executed(hardware: HardwareRun, duration: float) -> Run:
