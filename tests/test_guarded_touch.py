@@ -87,3 +87,4 @@ def test_only_its_own_word_starts_the_touch(typed, monkeypatch, capsys):
         robot.close()
     assert "Nothing was moved" in capsys.readouterr().out
     assert robot.sent == [] and robot.watchdog is None
+    assert config.board_height is None, "nobody has measured it"

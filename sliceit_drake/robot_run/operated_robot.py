@@ -186,7 +186,8 @@ class OperatedRobot:
         Raises:
             ConfigurationError: The board is not where it is expected.
         """
-        config, self.found = self.config, None
+        # Its own copy: an expected height is not a measured one until the knife has met the board.
+        config, self.found = dc.replace(self.config), None
         field = "scenario.board.height" if config.board_height is None else "board_height"
         if config.board_height is None:
             config.board_height = scenario.board.height
@@ -217,7 +218,7 @@ class OperatedRobot:
             f"the arm; the force rose to {found.peak_force:.1f} N."
         )
         check_height(found, touch.expected, config.touch.tolerance, field)
-        config.board_height = found.height
+        self.config.board_height = found.height
         print("This run takes the height that was found.\n")
         return True
 
