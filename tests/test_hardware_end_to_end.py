@@ -20,6 +20,7 @@ from hardware_bench import (
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.resources import resource_path
+from sliceit_drake.robot_run import operated_robot
 from sliceit_drake.systems.policy import PressByForce
 
 pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
@@ -209,3 +210,24 @@ def test_after_a_breach_of_force_the_knife_goes_back_if_the_operator_says_so(
         assert re.search("The knife is back.*program is stopped", printed, re.S), printed
         assert log.read_text().count("\n") > 100
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+
+
+def test_ctrl_c_at_the_question_of_a_retreat_leaves_the_record_of_the_slice(
+    tmp_path, monkeypatch, capsys
+):
+    asked = operated_robot.ask
+
+    def interrupted(word, is_emulated):
+        if word == "retreat":
+            raise KeyboardInterrupt
+        return asked(word, is_emulated)
+
+    monkeypatch.setattr(operated_robot, "ask", interrupted)
+    with emulated(SPRING, "measurement: null") as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["slice"], "--set-robot", "limits.force=6",
+            scenario=SPRING, overrides="measurement: null",
+        )  # fmt: skip
+    assert code == 130 and "RETREAT: the knife" in capsys.readouterr().out
+    names = {"record.csv", "robot.csv", "summary.json", "slice.csv", "slice.yaml"}
+    assert names <= {file.name for file in tmp_path.iterdir()}

@@ -36,6 +36,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hardware.client import is_loopback
 
 if TYPE_CHECKING:
+    from sliceit_drake.diagrams.run import Run
     from sliceit_drake.robot_run.operated_robot import OperatedRobot
 
 __all__ = ["add_arguments", "add_robot_arguments", "robot_of", "run"]
@@ -112,6 +113,9 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
     from sliceit_drake.records.slice_record import write_record
 
+    def keep(ended: "Run") -> None:
+        write_record(slice_record_of(ended, "UR5e through RTDE."), directory / "slice")
+
     made = robot.run(
         scenario,
         directory,
@@ -119,12 +123,12 @@ def run(options: argparse.Namespace) -> int:
         touch=options.touch,
         duration=options.duration,
         draws=not options.no_replay,
+        keep=keep,
     )
     if made is None:
         return 1
     if options.dry_run:
         return 1 if made.stopped else 0
-    write_record(slice_record_of(made, "UR5e through RTDE."), directory / "slice")
     print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
     return 1 if made.stopped else 0
 

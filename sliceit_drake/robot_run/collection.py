@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses as dc
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,11 +73,11 @@ class Collection:
             else:
                 made = prepare_run(scenario)
                 made.advance()
+                self._write(specimen, made)
             if made is None:
                 return False
             if is_dry:
                 return not made.stopped
-            self._write(made, specimen)
             if made.stopped:
                 print(f"Stopped: {made.stopped}. Its record is kept. Start again to go on.")
                 return False
@@ -105,9 +106,13 @@ class Collection:
         print(f"Put under the knife: {_what(specimen.condition)}. Stand back.")
         if self.put_fresh_food is not None and not robot.dry_run:
             self.put_fresh_food(scenario)
-        return robot.run(scenario, self.directory / slice_name(specimen.index))
+        return robot.run(
+            scenario,
+            self.directory / slice_name(specimen.index),
+            keep=functools.partial(self._write, specimen),
+        )
 
-    def _write(self, made: Run, specimen: Specimen) -> None:
+    def _write(self, specimen: Specimen, made: Run) -> None:
         is_real = self.robot is not None
         provenance = "UR5e through RTDE." if is_real else "Simulated station, sliceit collect."
         record = slice_record_of(

@@ -8,7 +8,7 @@ import termios
 import threading
 import time as clock
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Self, TextIO
@@ -87,6 +87,7 @@ class OperatedRobot:
         touch: bool = False,
         duration: float | None = None,
         draws: bool = False,
+        keep: Callable[[Run], object] | None = None,
     ) -> Run | None:
         """Connects, checks, asks for the word, runs, and writes the outputs.
 
@@ -97,6 +98,8 @@ class OperatedRobot:
             touch: Whether to find the board's height then.
             duration: Duration, s; None for the motion's.
             draws: Whether to write a replay.
+            keep: Writes what else the caller keeps of a run, with the outputs, before anything else
+                is asked, such as for a retreat: whatever ends that, the record is complete.
 
         Returns:
             The run; None if the robot was not ready or the operator did not confirm.
@@ -110,7 +113,7 @@ class OperatedRobot:
         with self.connected() as client:
             meshcat = make_meshcat() if draws and not self.dry_run else None
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
-            made = self.checked_run(hardware, directory, duration)
+            made = self.checked_run(hardware, directory, duration, keep)
         if Retreat.is_offered_after(hardware):
             self.retreat(hardware, directory)
         return made
@@ -223,7 +226,11 @@ class OperatedRobot:
         return True
 
     def checked_run(
-        self, hardware: HardwareRun, directory: Path, duration: float | None = None
+        self,
+        hardware: HardwareRun,
+        directory: Path,
+        duration: float | None = None,
+        keep: Callable[[Run], object] | None = None,
     ) -> Run | None:
         """The same as `run` with a robot that is connected already, and at the start."""
         if not _report("Robot and plan", hardware.check_before()):
@@ -241,7 +248,7 @@ class OperatedRobot:
                 print(f"NOT READY: {made.stopped}")
                 print(_stopped_text(hardware.link))
             return made
-        return _slice(hardware, duration, directory) if self.asks(WORD) else None
+        return _slice(hardware, duration, directory, keep) if self.asks(WORD) else None
 
     @staticmethod
     def report(title: str, checks: Sequence[Check]) -> bool:
@@ -369,7 +376,12 @@ def _room(directory: Path) -> Check:
     )
 
 
-def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
+def _slice(
+    hardware: HardwareRun,
+    duration: float,
+    directory: Path,
+    keep: Callable[[Run], object] | None,
+) -> Run:
     """Runs, tells the operator how it ended, and writes what was measured, whatever ended it."""
     hardware.abandoned = _end_a_diagram_that_stands
     with interrupted_once():
@@ -384,7 +396,7 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
             # What was not prepared has sent nothing, and has no record.
             if hardware.run is not None and hardware.link is not None:
                 with handle_signals(ENDING, _say_still_writing):
-                    _tell_and_write(hardware, hardware.run, directory)
+                    _tell_and_write(hardware, hardware.run, directory, keep)
     return made
 
 
@@ -414,7 +426,9 @@ def _executed(hardware: HardwareRun, duration: float) -> Run:
         return hardware.execute(duration, show)
 
 
-def _tell_and_write(hardware: HardwareRun, made: Run, directory: Path) -> None:
+def _tell_and_write(
+    hardware: HardwareRun, made: Run, directory: Path, keep: Callable[[Run], object] | None
+) -> None:
     """Says first how a run has ended: a full disk, or a record that takes long, must not keep that
     from the operator."""
     if made.stopped:
@@ -423,6 +437,8 @@ def _tell_and_write(hardware: HardwareRun, made: Run, directory: Path) -> None:
         _tell("".join(traceback.format_exception(hardware.error)), file=sys.stderr)
     try:
         summary = write_hardware_outputs(hardware, directory)
+        if keep is not None:
+            keep(made)
     except OSError as error:
         _tell(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
         raise
