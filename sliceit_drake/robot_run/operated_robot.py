@@ -18,7 +18,7 @@ from sliceit_drake.diagrams.live_view import make_meshcat
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.hardware.checks import Check
-from sliceit_drake.hardware.client import RobotClient, is_loopback
+from sliceit_drake.hardware.client import RobotClient, RobotUnavailableError, is_loopback
 from sliceit_drake.hardware.guarded_touch import Touch, TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
 from sliceit_drake.hardware.real_time import RealTime
@@ -110,10 +110,16 @@ class OperatedRobot:
         if touch and not self.dry_run:
             if not self.find_board(scenario):
                 return None
-        with self.connected() as client:
-            meshcat = make_meshcat() if draws and not self.dry_run else None
-            hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
-            made = self.checked_run(hardware, directory, duration, keep)
+        made: Run | None = None
+        try:
+            with self.connected() as client:
+                meshcat = make_meshcat() if draws and not self.dry_run else None
+                hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
+                made = self.checked_run(hardware, directory, duration, keep)
+        except RobotUnavailableError:
+            # Who confirms no stop has ended the run as stopped, and the operator was told.
+            if made is None or not made.stopped:
+                raise
         if Retreat.is_offered_after(hardware):
             self.retreat(hardware, directory)
         return made
