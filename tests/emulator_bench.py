@@ -10,9 +10,9 @@ import numpy as np
 from sliceit_drake.emulator.control_script import ControlScript
 from sliceit_drake.emulator.controller import Controller, ControllerConfig
 from sliceit_drake.emulator.emulator import Emulator
-from sliceit_drake.emulator.frames import PackageType, Recipe, encode_frame, take_frames
 from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import KinematicRobot
+from sliceit_drake.emulator.rtde_server import PackageType, Recipe, encode_frame, take_frames
 
 _number = itertools.count(1)
 

@@ -21,7 +21,11 @@ from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript, 
 from sliceit_drake.emulator.controller import ControllerConfig
 from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 from sliceit_drake.emulator.fault_table import FAULTS
-from sliceit_drake.emulator.frames import (
+from sliceit_drake.emulator.kinematics import Posture, forward, inverse, pose_of_matrix
+from sliceit_drake.emulator.modes import RobotMode, RuntimeState, SafetyMode
+from sliceit_drake.emulator.process import PendantClient
+from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
+from sliceit_drake.emulator.rtde_server import (
     FrameError,
     PackageType,
     Recipe,
@@ -29,10 +33,6 @@ from sliceit_drake.emulator.frames import (
     split_names,
     take_frames,
 )
-from sliceit_drake.emulator.kinematics import Posture, forward, inverse, pose_of_matrix
-from sliceit_drake.emulator.modes import RobotMode, RuntimeState, SafetyMode
-from sliceit_drake.emulator.process import PendantClient
-from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
 from sliceit_drake.emulator.station_robot import JointTargets, StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
 from sliceit_drake.hardware.control_script import control_script
