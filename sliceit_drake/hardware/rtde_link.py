@@ -60,6 +60,7 @@ class LinkStatus(NamedTuple):
         lateness: Wall time since the state before, less the period at the link's pace, s.
         cycles: States seen.
         missed: Cycles of the controller of which no state was seen.
+        sent: Targets sent.
         stop: Why the safety layer is latched, or None.
     """
 
@@ -69,6 +70,7 @@ class LinkStatus(NamedTuple):
     lateness: float
     cycles: int
     missed: int
+    sent: int
     stop: Stop | None
 
 
@@ -284,14 +286,14 @@ class RobotLink:
         longest = self._safety.limits.state_age / pace
         first = clock.perf_counter()
         last_time, last_arrival = client.timestamp(), first
-        cycles = missed = 0
+        cycles = missed = sent = 0
         state: RobotState | None = None
         while not self._ending:
             time = client.timestamp()
             if time == last_time:
                 command = self._command
                 if state and self._armed and self._is_new(command, state):
-                    self._cycle(state)  # The answer goes out at once, not a cycle later.
+                    sent += self._cycle(state)  # The answer goes out at once, not a cycle later.
                     continue
                 silence = clock.perf_counter() - last_arrival
                 if self._armed and silence > longest and not self._halted:
@@ -311,11 +313,11 @@ class RobotLink:
             lateness = arrival - last_arrival - period / pace
             self._log.append((state, lateness, None))
             if self._armed:
-                self._cycle(state)
+                sent += self._cycle(state)
             with self._changed:
                 self._status = LinkStatus(
-                    state, arrival, period, lateness, cycles, missed, self._safety.stop
-                )
+                    state, arrival, period, lateness, cycles, missed, sent, self._safety.stop,
+                )  # fmt: skip
                 self._changed.notify_all()
             last_time, last_arrival = state.time, arrival
 
@@ -325,8 +327,8 @@ class RobotLink:
             return False
         return command.number != self._judged
 
-    def _cycle(self, state: RobotState) -> None:
-        """Judges a state and the newest command, and sends."""
+    def _cycle(self, state: RobotState) -> bool:
+        """Judges a state and the newest command, and sends; whether a target went out."""
         client, safety, command = self._client, self._safety, self._command
         if not client.is_connected():
             self._latch_fault("link", "a connection to the robot was lost")
@@ -355,7 +357,7 @@ class RobotLink:
                 self._halt()
             elif command is None:
                 client.kick()
-            return
+            return False
         self._served = state
         self._log[-1] = (*self._log[-1][:2], decision.q)
         begin = clock.perf_counter()
@@ -365,6 +367,7 @@ class RobotLink:
             self._latch_fault("link", "the robot's program did not take a target")
         elif took > SLOW_CALL / self._pace:
             self._latch_fault("link", f"sending a target took {took:.3g} s: the link reconnected")
+        return True
 
     def _is_held_too_long(self, time: float) -> bool:
         """Whether a latched arm was held at rest for longer than it takes to end a run."""
