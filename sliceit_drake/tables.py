@@ -1,6 +1,7 @@
 """Tables of numbers: CSV files, with errors that name file, row and column, and interpolation."""
 
 import csv
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,12 +14,12 @@ __all__ = [
     "interpolated",
     "read_columns",
     "read_rows",
-    "read_text",
     "require_increasing",
+    "table_text",
 ]
 
 
-def read_text(file: str | Path) -> str:
+def table_text(file: str | Path) -> str:
     """The text of a table, UTF-8, with or without the mark that some programs begin it with.
 
     Raises:
@@ -45,7 +46,7 @@ def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
     Raises:
         ConfigurationError: If the file cannot be read.
     """
-    rows = enumerate(csv.reader(read_text(file).splitlines()), start=1)
+    rows = enumerate(csv.reader(io.StringIO(table_text(file), newline="")), start=1)
     try:
         return [(number, [cell.strip() for cell in row]) for number, row in rows if row]
     except csv.Error as error:

@@ -184,9 +184,14 @@ def test_a_command_that_goes_on_says_so_when_it_is_interrupted(tmp_path, monkeyp
         time.sleep(10.0)
 
     monkeypatch.setattr(output_folder, "check_output", interrupt)
-    for command, goes_on in ((["calibrate", "x", "--food", "cucumber"], True), (["export"], False)):
-        folder = [] if goes_on else [str(tmp_path)]
-        assert main([*command, *folder, "--output", str(tmp_path / "out")]) == 130
+    calibrate = ["calibrate", "x", "--food", "cucumber"]
+    (tmp_path / "begun").mkdir()
+    for command, folder, goes_on in (
+        (calibrate, "begun", True),
+        (calibrate, "nothing_yet", False),
+        (["export", str(tmp_path)], "begun", False),
+    ):
+        assert main([*command, "--output", str(tmp_path / folder)]) == 130
         error = capsys.readouterr().err
         assert error.startswith("sliceit: interrupted")
         assert ("the same command goes on" in error) == goes_on

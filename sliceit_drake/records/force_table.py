@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.tables import finite_number, read_text, require_increasing
+from sliceit_drake.tables import finite_number, require_increasing, table_text
 
 __all__ = ["UNITS", "ForceTable", "find_contact", "one_slice", "read_force_table"]
 
@@ -191,7 +191,7 @@ def _rows(file: str | Path) -> list[tuple[int, list[str]]]:
     """Cells of all lines that hold something, with their numbers."""
     lines = [
         (number, line.strip())
-        for number, line in enumerate(read_text(file).splitlines(), start=1)
+        for number, line in enumerate(table_text(file).splitlines(), start=1)
         if line.strip() and not line.startswith("#")
     ]
     body = [line for _, line in lines[len(lines) // 4 :]]
