@@ -5,6 +5,7 @@ Synthetic records: the sensitivities are given shapes, so that no slice is simul
 
 import dataclasses as dc
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from sliceit_drake.diagnosis.evidence.verdict import (
     Verdict,
     reach_verdict,
 )
+from sliceit_drake.diagnosis.result import Diagnosis
 from studies.hidden_effects.sizes import effect_in_noise
 
 
@@ -347,6 +349,29 @@ def test_what_the_form_of_a_named_cause_leaves_is_no_second_cause():
     assert verdict.names == [["saw"]]
     assert "without saw" in next(c.why for c in verdict.causes if c.name == "hum")
     assert ["hum"] in reach_verdict(whole, 60, rule=DecisionRule(left=0.0)).names
+
+
+def test_the_report_draws_no_evidence_where_there_is_none():
+    """A gain of nothing is no bar, and one that chance never gives is not infinite."""
+    cause = SimpleNamespace(parameter=lambda name: SimpleNamespace(null=0.0))
+    for whole in (problem(10), problem(40, unknown=1.5)):
+        verdict = reach_verdict(whole, 60)
+        causes = dict.fromkeys((e.name for e in verdict.screening.causes), cause)
+        result = Diagnosis(verdict, whole, None, causes, {}, None, [])
+        most = max(e.gain for e in verdict.screening.causes)
+        assert min(e.gain for e in verdict.screening.causes) == 0.0 and not verdict.findings
+        for axis in (result.plot_evidence().axes[0], result.plot_overview().axes[2]):
+            widths = [bar.get_width() for bar in axis.patches]
+            assert min(widths) == 0.0 and max(widths) <= most and axis.get_xlim()[0] == 0.0
+
+
+def test_a_shift_is_told_only_where_what_is_wrong_is_understood():
+    shifts = {"material.toughness": (1.5, 0.01)}
+    for whole, told in ((problem(10), True), (problem(40, unknown=1.5), False)):
+        verdict = reach_verdict(whole, 60)
+        assert verdict.kind == ("nothing" if told else "unknown")
+        result = Diagnosis(verdict, whole, None, {}, shifts, None, [])
+        assert ("Shift of material.toughness" in result.table()) == told
 
 
 def test_what_no_cause_explains_is_unknown():

@@ -197,6 +197,20 @@ def test_a_command_that_goes_on_says_so_when_it_is_interrupted(tmp_path, monkeyp
         assert ("the same command goes on" in error) == goes_on
 
 
+def test_each_stage_has_a_bar_that_is_there_from_its_beginning_and_ends_with_it(capsys):
+    with StageBars() as bars:
+        bars.show("long", 0, 2)
+        assert "long:   0%" in capsys.readouterr().err
+        bars.show("long", 2, 2)
+        bars.show("grows", 1, 2)
+        bars.show("grows", 2, 3)
+        bars.show("long", 1, 2)  # It comes again.
+        bars.show("grows", 3, 3)
+    shown = capsys.readouterr().err
+    assert "2/2" in shown and "3/3" in shown and "grows: 3it" not in shown
+    assert shown.index("long: 100%") < shown.index("long:  50%")
+
+
 def leave_a_note(folder: Path) -> None:
     """For a process: works until it is ended."""
     try:

@@ -581,24 +581,34 @@ def test_a_motion_that_ends_without_a_confirmed_stop_is_no_success(
     assert json.loads((tmp_path / "summary.json").read_text())["stopped"] == made.stopped
 
 
+def after_twenty_targets(monkeypatch, happens):
+    """Lets something happen in the diagram in the middle of a confirmed run."""
+    send, sent = RtdeSystem.send, []
+
+    def count(system, context):
+        sent.append(1)
+        if len(sent) > 20:
+            happens()
+        send(system, context)
+
+    monkeypatch.setattr(RtdeSystem, "send", count)
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+
+
 def test_a_diagram_that_does_not_come_back_is_ended_and_its_stop_is_told(
     robot, monkeypatch, capsys, tmp_path
 ):
-    send, sent = RtdeSystem.send, []
+    came_back = []
 
-    def stands(system, context):
-        sent.append(1)
-        if len(sent) > 20:
-            clock.sleep(60.0)
-            sent.append("came back")
-        send(system, context)
+    def stands():
+        clock.sleep(60.0)
+        came_back.append(True)
 
+    after_twenty_targets(monkeypatch, stands)
     monkeypatch.setattr("sliceit_drake.hardware.rtde_link.HOLD_TIME", 0.1)
-    monkeypatch.setattr(RtdeSystem, "send", stands)
-    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
     with catch_signals():
         made = checked_run(robot, tmp_path, 2.0)
-    assert "came back" not in sent
+    assert not came_back
     assert made.stopped.startswith("command_age") and robot.stopped.is_set()
     printed = capsys.readouterr()
     assert "STOPPED: command_age" in printed.out and "STOPPED: command_age" in printed.err
@@ -608,16 +618,10 @@ def test_a_diagram_that_does_not_come_back_is_ended_and_its_stop_is_told(
 def test_an_error_in_the_diagram_stops_the_robot_and_keeps_the_record(
     robot, monkeypatch, capsys, tmp_path
 ):
-    send, sent = RtdeSystem.send, []
+    def broken():
+        raise ValueError("the policy decides nan")
 
-    def broken(system, context):
-        sent.append(1)
-        if len(sent) > 20:
-            raise ValueError("the policy decides nan")
-        send(system, context)
-
-    monkeypatch.setattr(RtdeSystem, "send", broken)
-    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    after_twenty_targets(monkeypatch, broken)
     made = checked_run(robot, tmp_path, 2.0)
     assert made.stopped == "ValueError: the policy decides nan"
     assert robot.stopped.is_set()

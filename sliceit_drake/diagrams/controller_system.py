@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.systems.declare import declare_cached, declare_output
+from sliceit_drake.systems.declare import declare_cached, declare_output, where_and_when
 from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
 
 __all__ = ["ControllerSystem"]
@@ -105,8 +105,7 @@ class ControllerSystem(LeafSystem):
         command = np.asarray(self.advance(context, q), float)
         if command.shape != (6,) or not np.isfinite(command).all():
             raise RuntimeError(
-                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s "
-                f"{type(self).__name__}.advance returned {command}. It has to return the positions "
-                "of six joints."
+                f"{where_and_when(self, context)} {type(self).__name__}.advance returned {command}."
+                " It has to return the positions of six joints."
             )
         discrete_state.set_value(self._command, command)

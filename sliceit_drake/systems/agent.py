@@ -33,7 +33,12 @@ from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValue
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.systems.agent_rule import PROGRESS, AgentRule
-from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
+from sliceit_drake.systems.declare import (
+    PlainSystem,
+    declare_cached,
+    declare_output,
+    where_and_when,
+)
 from sliceit_drake.systems.policy import envelope, envelope_time
 
 __all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
@@ -346,8 +351,8 @@ class AgentSystem(PlainSystem):
             action = self._action_in.Eval(context)
         if action.shape != (len(ACTIONS),) or not np.isfinite(action).all():
             raise RuntimeError(
-                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s the policy decided "
-                f"for {action}; {len(ACTIONS)} finite numbers are needed ({', '.join(ACTIONS)})."
+                f"{where_and_when(self, context)} the policy decided for {action}; {len(ACTIONS)} "
+                f"finite numbers are needed ({', '.join(ACTIONS)})."
             )
         action = np.clip(action, -1.0, 1.0)
         if config.rule is not None:

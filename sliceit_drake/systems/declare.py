@@ -1,4 +1,4 @@
-"""A base class of systems; output ports and cached values by functions that return the value."""
+"""A base class of systems; ports and cached values by functions that return the value; errors."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-__all__ = ["PlainSystem", "declare_cached", "declare_output"]
+__all__ = ["PlainSystem", "declare_cached", "declare_output", "where_and_when"]
 
 
 class PlainSystem(LeafSystem):
@@ -69,3 +69,8 @@ def declare_cached(
         calc=lambda context, value: value.set_value(calc(context)),
     )
     return system.DeclareCacheEntry(name, producer, prerequisites)
+
+
+def where_and_when(system: LeafSystem, context: Context) -> str:
+    """Path of a system and its context's time, with which the message of an error begins."""
+    return f"{system.GetSystemPathname()}: at t = {context.get_time():.6g} s"

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, DiscreteStateIndex, EventStatus, 
 
 from sliceit_drake.cutting.motion import small_motion
 from sliceit_drake.systems.cut_report import ReportingSystem
-from sliceit_drake.systems.declare import PlainSystem, declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output, where_and_when
 
 __all__ = ["KEPT", "LAST_POSE", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
@@ -178,9 +178,9 @@ class KnifeForceSystem(ReportingSystem):
             is_right = False
         if not is_right:
             raise RuntimeError(
-                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s "
-                f"{type(self).__name__}.advance returned {found!r}. It has to return the wrench on "
-                "the knife, six finite numbers, and the fraction that is cut, within 0 and 1."
+                f"{where_and_when(self, context)} {type(self).__name__}.advance returned {found!r}."
+                " It has to return the wrench on the knife, six finite numbers, and the fraction "
+                "that is cut, within 0 and 1."
             )
         last, now = kept[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
         wrench = x.get_mutable_value(self._wrench)

@@ -21,7 +21,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
-from sliceit_drake.systems.declare import PlainSystem, declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output, where_and_when
 
 __all__ = [
     "Policy",
@@ -238,15 +238,16 @@ class PolicySystem(PlainSystem):
         history = np.vstack([seen[1:], wrench])
         with self.watch():
             action = config.decide.decide(PolicyObservation(context.get_time(), offset, history))
-        when = f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s"
         if not isinstance(action, PolicyAction):
             raise RuntimeError(
-                f"{when} {type(config.decide).__name__}.decide returned {action!r}, and no "
-                "PolicyAction."
+                f"{where_and_when(self, context)} {type(config.decide).__name__}.decide returned "
+                f"{action!r}, and no PolicyAction."
             )
         wanted = np.array([action.draw, action.press], float)
         if not np.isfinite(wanted).all():
-            raise RuntimeError(f"{when} the policy decided for speeds of {wanted} m/s.")
+            raise RuntimeError(
+                f"{where_and_when(self, context)} the policy decided for speeds of {wanted} m/s."
+            )
         wanted *= min(1.0, config.speed / max(1e-12, math.hypot(*wanted)))
         motion = [*offset, *speed, *wanted, context.get_time()]
         discrete_state.set_value(self._motion, motion)
@@ -257,7 +258,10 @@ class PolicySystem(PlainSystem):
             new = getattr(action, name)
             new = old if new is None else np.asarray(new, float)
             if new.shape != (6,) or not np.isfinite(new).all():
-                raise RuntimeError(f"{when} the policy's {name} are {new}, and not six numbers.")
+                raise RuntimeError(
+                    f"{where_and_when(self, context)} the policy's {name} are {new}, and not six "
+                    "numbers."
+                )
             discrete_state.set_value(state, new)
 
     def _moved(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
