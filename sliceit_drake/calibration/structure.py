@@ -341,8 +341,8 @@ class _Search:
                 )
 
     def compare_with_given(self) -> None:
-        """Takes the setup's own food instead, if that predicts left-out depth as well on the
-        setup's mesh."""
+        """Takes the setup's own food instead, if on the setup's mesh that predicts left-out depth
+        better by `GAIN` or more."""
         given = _elements_of(self._setup, self._elements)
         if not given or set(given) == set(self.taken):
             return

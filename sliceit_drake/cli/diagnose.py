@@ -7,13 +7,13 @@ condition at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
   extended.yaml   the food and its bench with the cause in them: `calibration: DIR/extended.yaml`
                   in a scenario
 
-The verdict is one of: nothing beyond noise; one to three causes with size; a class of causes that
+The verdict is one of: nothing beyond noise; one to three causes with size; a group of causes that
 these records cannot tell apart, and the experiment that would; unknown; too few replicates. For a
 single record it is `one_slice`: what that slice shows, and no diagnosis; no food is extended by it.
 
 With --next-experiment FILE it writes what to cut next: a scenario for `sliceit simulate`, for
 `sliceit record` and for the robot, with the angles to expect and the number of slices. This
-simulates a menu of motions, some 200 slices for a class of three causes. Old and new records are
+simulates a menu of motions, some 200 slices for a group of three causes. Old and new records are
 then diagnosed together; give the folders in the order in which they were recorded.
 
   sliceit diagnose records/monday --model cucumber --output output/diagnosis

@@ -8,9 +8,10 @@ the plan; waits until you type the word "slice"; runs; stops the program on the 
 limit that is broken it stops for good and says why. With --dry-run it does all of this but move:
 it watches the robot's data for a second instead.
 
-The board's height must be known: from the robot's file, from --board-height, or by --touch. With
+A slice needs the board's height: from the robot's file, from --board-height, or by --touch. With
 --touch the bare knife first goes down from the start, slowly, after you typed the word "touch",
 until it meets the board, and back up. A height that is not the expected one ends the program.
+--move-to-start and --touch move the arm without it, too, and expect the scenario's height.
 
 Writes to DIR what `sliceit simulate` writes, and
   robot.csv          what came from the robot and what was sent, in every cycle

@@ -38,8 +38,7 @@ class Knife:
 
     Knife frame K: origin at the middle of the edge, Kx along the edge, Kz from the spine to the
     edge, Ky the blade's normal. The section is the convex polygon tip, shoulder, spine, mirrored in
-    the plane y = 0. Defaults are the knife of the SliceIt! configuration ("gazebo"); see
-    docs/explanation/physics.md.
+    the plane y = 0. Defaults are the knife of the SliceIt! configuration ("gazebo").
     """
 
     profile: str = choice("straight", ("straight", *UNSUPPORTED))

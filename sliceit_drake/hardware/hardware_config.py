@@ -32,8 +32,8 @@ class SafetyLimits:
     The defaults are for slow slicing beside a person who holds the emergency stop. Their sources:
     the UR5e's published ranges and joint limits (Universal Robots' technical details; model file
     models/ur5e/ur5e.urdf) bound them, and the motion of the scenario cucumber_measured, simulated,
-    needs 0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error
-    (docs/how_to/hardware.md). In between they are choices, not measurements.
+    needs 0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error.
+    In between they are choices, not measurements.
     """
 
     joint_lower: list[float] = quantity(
@@ -171,7 +171,7 @@ class HardwareConfig:
     cog_tolerance: float = quantity(0.01, "m", low=0.0, high=0.2)
     """How far its centre of gravity may be off."""
     board_height: float | None = quantity(None, "m", low=-1.0, high=2.0)
-    """Measured height of the board's surface in the world; null: unknown, nothing moves."""
+    """Measured height of the board's surface in the world; null: unknown, no slice begins."""
     unzeroed_force: float = quantity(10.0, "N", low=0.1, high=50.0)
     """Most that the sensor may show in the air before zeroing, less the payload's weight."""
     sensor_force: float = quantity(3.0, "N", low=0.1, high=20.0)

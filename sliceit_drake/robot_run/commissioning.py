@@ -88,8 +88,9 @@ class Commissioning:
         self._steps: list[tuple[str, str, Callable[[Path], StepResult]]] = [
             (
                 "push",
-                "No food, the knife high over the board. After the word, press the knife straight "
-                "up by its handle with about 10 N, and let go. Nothing moves.",
+                "No food. The arm goes to its start, high over the board: stay away. Only after "
+                "the word push, when it stands still, press the knife straight up by its handle "
+                "with about 10 N, and let go.",
                 self._push,
             ),
             (
@@ -175,7 +176,7 @@ class Commissioning:
     def _air(self, directory: Path) -> StepResult:
         most = self._robot.config.sensor_force
         made = self._run(self._in_the_air(), directory)
-        criterion = f"it ends by itself, under {most:g} N, with less than {MISSED:.0%} missed"
+        criterion = f"it ends by itself, under {most:g} N, with at most {MISSED:.0%} missed"
         return self._judged(made, directory, criterion, 0.0, most)
 
     def _stop(self, directory: Path) -> StepResult:
@@ -235,7 +236,7 @@ class Commissioning:
     def _cut(self, directory: Path) -> StepResult:
         most = SHARE * self._robot.config.limits.force
         made = self._run(copy.deepcopy(self._scenario), directory)
-        criterion = f"it ends by itself, under {most:g} N, with less than {MISSED:.0%} missed"
+        criterion = f"it ends by itself, under {most:g} N, with at most {MISSED:.0%} missed"
         return self._judged(made, directory, criterion, 0.0, most)
 
     def _in_the_air(self) -> Scenario:

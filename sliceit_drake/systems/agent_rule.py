@@ -43,8 +43,8 @@ class AgentRule:
     correction: float = quantity(0.5, "", low=0.0, high=2.0)
     """Most by which a network changes each of its actions."""
     patience: float = quantity(0.0, "s", low=0.0, high=100.0)
-    """Time without way down in which the level doubles, once more in each such time; 0 for never.
-    Food that asks for more than the level would hold the knife for ever."""
+    """Time without way down in which the level grows by its own value; 0 for never. Food that asks
+    for more than the level would hold the knife for ever."""
 
     def action(
         self,

@@ -294,14 +294,18 @@ def run(options: argparse.Namespace) -> int:
 HEAD = """\
 # Curves with something wrong
 
-This page shows typical mistakes in a new user's curve, and what import and calibration say about
-them. The good curve is the paper's potato; `studies/calibration/adversarial.py` makes the others.
-"Used" means that the commands end well, with or without a warning. "Right" means that the message
-names the fault; the expected messages were written down after an earlier run had been seen. Three
-faults cannot be told from good curves. A potato of 3 N is possible, so kgf cannot be recognised. A
-force that only grows is said to leave modulus and toughness open, as many good curves do. And an
-offset cannot be taken off a curve that begins in the food. The warning in the first row is about
-the coarse mesh, not about the curve.
+Import and calibration name the fault in all of these typical mistakes of a new user but three,
+which cannot be told from good curves:
+
+- kgf: a potato of 3 N is possible.
+- A force that only grows is said to leave modulus and toughness open, as in many good curves.
+- An offset cannot be taken off a curve that begins in the food.
+
+The good curve is the paper's potato; `studies/calibration/adversarial.py` makes the others. "Used"
+means that the commands end well, with or without a warning. "Right" means that the message names
+the fault, or that a curve that can be used as it is gets none; the expected messages were written
+down after an earlier run had been seen. The warning in the first row is about the coarse mesh, not
+about the curve.
 
     python -m studies adversarial --output docs/results/adversarial_curves.md
 

@@ -417,9 +417,9 @@ def _rows(replicates: Sequence[Replicate], found: Sequence[Found]) -> list[tuple
 
 def _wrapped(paragraph: str) -> str:
     """A paragraph of a page in lines of 100; titles, pictures, commands and tables as they are."""
-    return (
-        paragraph if paragraph.startswith(("#", " ", "|", "!")) else textwrap.fill(paragraph, 100)
-    )
+    if paragraph.startswith(("#", " ", "|", "!")):
+        return paragraph
+    return textwrap.fill(paragraph, 100, break_on_hyphens=False)
 
 
 def _quantiles(values: np.ndarray) -> str:
