@@ -478,6 +478,18 @@ def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
     assert all(p.why for p in setup.parameters)
 
 
+@pytest.mark.parametrize("name", ["apple", "carrot", "cucumber", "potato", "tomato"])
+def test_a_shipped_food_is_cut_with_the_values_that_its_distribution_has(name):
+    shipped = load_calibrated_food(name)
+    for parameter, value in shipped.distribution.values().items():
+        *path, last = parameter.split(".")
+        place = shipped.food
+        for part in path:
+            place = getattr(place, part)
+        cut_with = place[int(last)] if last.isdigit() else getattr(place, last)
+        assert cut_with == pytest.approx(value, rel=1e-4), parameter
+
+
 def test_a_setup_with_a_parameter_that_does_not_exist_is_refused(tmp_path):
     file = tmp_path / "food.yaml"
     file.write_text("parameters: [{name: material.toughnes, low: 1.0, high: 2.0}]\n")
