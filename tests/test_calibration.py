@@ -478,7 +478,7 @@ def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
     assert all(p.why for p in setup.parameters)
 
 
-@pytest.mark.parametrize("name", ["apple", "carrot", "cucumber", "potato", "tomato"])
+@pytest.mark.parametrize("name", ["apple", "carrot", "potato", "tomato"])
 def test_a_shipped_food_is_cut_with_the_values_that_its_distribution_has(name):
     shipped = load_calibrated_food(name)
     for parameter, value in shipped.distribution.values().items():

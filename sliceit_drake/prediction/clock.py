@@ -50,8 +50,9 @@ class Clock:
     def stretches(self, moved: np.ndarray, first: int, last: int) -> Stretches:
         """Divides the grid from row `first` to beyond `last`.
 
-        A coupling step is at most twice as long as the one before it, and only `settling` blocks
-        after the motion allows it, so that food settles after a stop at every scale of time.
+        A coupling step is at most twice as long as the one before it, and only after the motion has
+        allowed it for more than `settling` blocks, so that food settles after a stop at every scale
+        of time.
 
         Args:
             moved: Way of the knife in each period [N], metres; 0 where it touches nothing.

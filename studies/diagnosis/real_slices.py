@@ -256,8 +256,7 @@ def _worst(result: OneSlice) -> str:
         f"The residual of the fit is largest at {fit[0]} ({fit[3]:.2f} N RMS, mean {fit[2]:+.2f}"
         f" N), and the error where depth was left out at {out[0]} ({out[4]:.2f} N). The residual"
         f" is correlated over {1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N; {noise.white:.2f} N are"
-        " white). It is therefore an error of the model or structure of this slice, not noise of"
-        " the sensor."
+        " white)."
     )
     if noise.tau > 0.45 * span:
         text += (

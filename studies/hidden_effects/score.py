@@ -17,7 +17,7 @@ __all__ = ["NAMING", "Judgement", "Rate", "judge", "judge_study", "rate"]
 
 NAMING = ("cause", "causes", "too_few_replicates")
 """Verdicts that give a name to what is wrong."""
-CLASS_ANGLE = 20.0
+MIMIC_ANGLE = 20.0
 """Causes that can do what was hidden to within this, degrees, are its class."""
 AS_WELL = 3.0
 """Difference of angles below which two causes explain an effect as well, degrees."""
@@ -128,7 +128,7 @@ def judge(
         own = angles.get(CAUSE_OF.get(h.effect, ""), 0.0)
         # One that looks for itself in the records has nothing to be near to here.
         least = own + AS_WELL if own < NOT_ITSELF else 0.0
-        allowed |= {n for n, angle in angles.items() if angle <= max(CLASS_ANGLE, least)}
+        allowed |= {n for n, angle in angles.items() if angle <= max(MIMIC_ANGLE, least)}
     # What is locked to depth no records tell from the law, and so not from one another.
     if allowed & set(LOCKED_TO_DEPTH) and any(LAW in c for c in named):
         allowed |= {*LOCKED_TO_DEPTH, LAW}
