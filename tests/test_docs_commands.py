@@ -157,6 +157,8 @@ TESTED = {
         " --seed 11 --output docs/results/corrected_evaluation.jsonl",
         "sliceit evaluate models/policies/corrected_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/results/corrected_evaluation.jsonl",
+        "sliceit evaluate models/policies/{spring_0,spring_2,cutting_0,cutting_3} --world stand_in"
+        " --foods cucumber --slices 8 --output FILE",
     ],
     "tests/test_foreign_law.py::test_policies_are_evaluated_by_it_and_finish": [
         "python -m studies foreign_law models/policies/{corrected,spring}_[0-4]"
@@ -272,6 +274,7 @@ READ_ONLY = {
         sliceit calibrate RECORD... --food cucumber --output DIR
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
+        sliceit calibrate calibration/records/potato.csv --food potato --start potato --output DIR
         sliceit calibrate --food carrot --literature --output DIR
         sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.85 --seed 32 --output old
         sliceit record next.yaml --replicates 4 --effect skin --refinement 0.85 --seed 132 --output new
