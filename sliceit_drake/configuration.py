@@ -172,8 +172,11 @@ def did_you_mean(name: str, options: collections.abc.Iterable[str], otherwise: s
 
 
 def unit_of(config: Any, path: str) -> str:
-    """Unit of the quantity at a dotted path in a configuration; "" where it has none."""
+    """Unit of the quantity, or of an element of it, at a dotted path in a configuration; "" where
+    it has none."""
     *parents, last = path.split(".")
+    if last.isdigit():
+        *parents, last = parents
     for part in parents:
         config = config[int(part)] if isinstance(config, list) else getattr(config, part)
     if not dc.is_dataclass(config):

@@ -18,6 +18,7 @@ from sliceit_drake.configuration import (
     dump_yaml,
     load_yaml,
     quantity,
+    unit_of,
     validate,
 )
 
@@ -270,6 +271,17 @@ def test_every_declared_field_of_the_package_says_what_it_means():
         and not (isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant))
     ]
     assert not undocumented
+
+
+def test_the_unit_of_a_field_and_of_an_element_of_one_is_found_by_its_path():
+    @dc.dataclass
+    class Station:
+        boards: list[Board] = dc.field(default_factory=lambda: [Board()])
+        offset: list[float] = quantity([0.0, 0.0], "m", low=-0.1, high=0.1, size=2)
+
+    station = Station()
+    paths = ("boards.0.height", "offset", "offset.1", "boards.0.spheres", "boards")
+    assert [unit_of(station, path) for path in paths] == ["m", "m", "m", "", ""]
 
 
 def test_a_list_default_is_not_shared_between_instances():

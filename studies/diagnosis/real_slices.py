@@ -16,8 +16,10 @@ import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.configuration import unit_of
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
@@ -217,7 +219,7 @@ def _layers(item: MeasuredSlice) -> str:
 
 def _food(item: MeasuredSlice) -> dict[str, Any]:
     """What the template tells of a food."""
-    plain = item.results["plain"]
+    plain, food = item.results["plain"], load_calibrated_food(item.food).food
     groups = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in plain.classes)
     return {
         "name": item.food,
@@ -231,7 +233,7 @@ def _food(item: MeasuredSlice) -> dict[str, Any]:
                     for depth, rows, mean, rms, out in result.by_depth()
                 ],
                 "evidence": _evidence_rows(result),
-                "fitted": _fitted(result),
+                "fitted": _fitted(result, food),
             }
             for name, result in item.results.items()
         ],
@@ -266,7 +268,7 @@ def _worst(result: OneSlice) -> str:
     return text
 
 
-def _fitted(result: OneSlice) -> str:
+def _fitted(result: OneSlice, food: Food) -> str:
     shown = []
     for c in result.evidence.causes:
         if c.confirmed is not None:
@@ -279,12 +281,13 @@ def _fitted(result: OneSlice) -> str:
             scan = result.causes[c.name].scan
             at = "" if scan is None or c.scan is None else f" at {scan.name} {c.scan:g} {scan.unit}"
             shown.append(f"`{c.name}`{at.rstrip()}: {values or 'none of it'}")
-    base = {
-        k.removeprefix("material.").removeprefix("effects.").removeprefix("numerics."): v
-        for k, v in result.fit.values("base").items()
-    }
+    base = [
+        f"{name.removeprefix('material.').removeprefix('effects.')} {value:.3g} "
+        f"{unit_of(food, name)}".rstrip()
+        for name, value in result.fit.values("base").items()
+    ]
     own = result.fit.values("own")
-    text = "Fitted: " + ", ".join(f"{k} {v:.3g}" for k, v in base.items())
+    text = "Fitted: " + ", ".join(base)
     if "height" in own:
         text += f"; knife {1e3 * own['height']:+.2f} mm lower than the onset of the force suggests"
     if "speed" in own:
