@@ -37,6 +37,7 @@ from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
+from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord, write_record
@@ -482,12 +483,7 @@ def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
 def test_a_shipped_food_is_cut_with_the_values_that_its_distribution_has(name):
     shipped = load_calibrated_food(name)
     for parameter, value in shipped.distribution.values().items():
-        *path, last = parameter.split(".")
-        place = shipped.food
-        for part in path:
-            place = getattr(place, part)
-        cut_with = place[int(last)] if last.isdigit() else getattr(place, last)
-        assert cut_with == pytest.approx(value, rel=1e-4), parameter
+        assert get_parameter(shipped.food, parameter) == pytest.approx(value, rel=1e-4), parameter
 
 
 def test_a_setup_with_a_parameter_that_does_not_exist_is_refused(tmp_path):
