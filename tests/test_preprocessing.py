@@ -86,6 +86,24 @@ def test_weight_inertia_and_zero_of_the_sensor_are_removed(inertia):
     assert record.metadata.processing == [], "the record that went in is as it was"
 
 
+@pytest.mark.parametrize("vertical", [False, True])
+def test_spikes_in_the_air_do_not_move_the_zero(vertical):
+    record = example_slice(0.05, seed=3)
+    if vertical:
+        record = dc.replace(record, force=None, torque=None, force_vertical=record.force[:, 2])
+    row = int(np.flatnonzero(record.first_phase("air"))[20])
+    faulty = dc.replace(record)
+    if vertical:
+        faulty.force_vertical = record.force_vertical.copy()
+        faulty.force_vertical[row] += 100.0
+    else:
+        faulty.force = record.force.copy()
+        faulty.force[row] += 100.0
+    zeros = [tare(r).metadata.processing[-1].numbers for r in (record, faulty)]
+    for name, zero in zeros[0].items():
+        assert zeros[1][name] == pytest.approx(zero, abs=2e-3)
+
+
 def test_filtered_velocities_still_remove_most_of_the_inertia():
     truth = swung_slice()
     truth.metadata.wrench.includes = ["food", "inertia"]

@@ -92,7 +92,7 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
         return
     if record.phase("air").all():
         return  # Such a record is there to show zero and drift; no force makes them large or small.
-    force = record.measured_force
+    force = without_spikes(record.measured_force)[0]
     mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
     peak = float(record.force_magnitude.max())
     # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.spikes import without_spikes
 from sliceit_drake.tables import interpolated
 
 __all__ = [
@@ -40,8 +41,8 @@ frequency its two passes of order 4 leave 1/18."""
 def tare(record: SliceRecord) -> SliceRecord:
     """Subtracts the mean wrench of the first air phase, as zeroing the sensor there would.
 
-    The zero of a sensor is constant in the sensor, hence in K: there it is averaged and subtracted.
-    Later air phases then show its drift.
+    The zero of a sensor is constant in the sensor, hence in K: there it is averaged, without
+    spikes, and subtracted. Later air phases then show its drift.
 
     Raises:
         ConfigurationError: If the first air phase has not 10 rows, or only the norm of the force is
@@ -57,7 +58,8 @@ def tare(record: SliceRecord) -> SliceRecord:
             fix="Leave the step tare out, or give components and an air phase.",
         )
     if record.force_vertical is not None:
-        zero = float(record.force_vertical[air].mean())
+        vertical = without_spikes(record.force_vertical[:, None])[0][air]
+        zero = float(vertical.mean())
         result = _with_step(record, "tare", {"force_vertical": zero})
         result.force_vertical = record.force_vertical - zero
         result.metadata.wrench.tared = "yes"
@@ -66,7 +68,8 @@ def tare(record: SliceRecord) -> SliceRecord:
     for name in ("force", "torque"):
         values = getattr(record, name)
         if values is not None:
-            in_K = np.einsum("nji,nj->ni", record.rotation[air], values[air]).mean(axis=0)
+            calm = without_spikes(values)[0][air]
+            in_K = np.einsum("nji,nj->ni", record.rotation[air], calm).mean(axis=0)
             setattr(result, name, values - record.rotation @ in_K)
             numbers = {f"{name}_{a}": float(v) for a, v in zip("xyz", in_K, strict=True)}
             result.metadata.processing[-1].numbers.update(numbers)
