@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.diagnosis.evidence import verdict
+from sliceit_drake.diagnosis.evidence import linear, verdict
 from sliceit_drake.diagnosis.experiments import next_experiment, proposal
 from sliceit_drake.prediction import discrepancy
 
 RULE = verdict.DecisionRule()
+DELAY = linear.USUAL["sensor_delay", "delay"][0]
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
@@ -17,7 +18,8 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
     [
         ("explanation/diagnosis", f"The alarm of {100 * RULE.alarm:g} %"),
         ("explanation/diagnosis", f"is at least {RULE.size:g} of noise and own error together"),
-        ("explanation/diagnosis", f"A delay has to be {RULE.size_known:g}"),
+        ("explanation/diagnosis", f"usual size ({1000 * DELAY:g} ms for the delay, half a cycle"),
+        ("explanation/diagnosis", f"A delay has to be {RULE.size_usual:g}"),
         ("explanation/diagnosis", f"An effect of {RULE.size_instead:g} is enough where another"),
         ("explanation/diagnosis", f"gains at least {RULE.gain:g} for each record, twice"),
         ("explanation/diagnosis", f"as many times less is enough, down to {RULE.right:g}"),

@@ -157,7 +157,7 @@ def test_a_sensor_is_as_late_as_it_was_in_the_records_that_an_error_is_known_fro
         LinearProblem(Sensitivities([*found.columns, late], records, known_from=n)) for n in (0, 9)
     )
     (usual,), (less,) = alone.usual.values(), then.usual.values()
-    assert usual == pytest.approx(0.15) and less == pytest.approx(0.015)
+    assert usual == pytest.approx(0.1) and less == pytest.approx(0.01)
 
 
 def test_a_simulation_is_wrong_by_a_tenth_beyond_what_is_known():

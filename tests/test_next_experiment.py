@@ -25,7 +25,7 @@ from sliceit_drake.diagnosis.experiments.planned_record import (
     planned_slice,
     scale_of,
 )
-from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment
+from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment, Pair
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
@@ -76,7 +76,7 @@ class Bench:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     # The class is found in this session; docs/results/hidden_effects.md says how often it is.
     folder = tmp_path_factory.mktemp("bench")
-    records = load_sessions([cut(POOR, folder / "old", 22)])
+    records = load_sessions([cut(POOR, folder / "old", 28)])
     diagnosis = diagnosis_of(sensitivities(SETUP, records, CAUSES, workers=2))
     with pytest.MonkeyPatch.context() as patch:
         # The whole menu would take a minute.
@@ -110,6 +110,14 @@ def test_the_proposed_motion_parts_causes_of_one_class(bench):
     assert bench.proposal.steps[0].experiment.name == "draw_1"
     assert 3 <= bench.proposal.steps[0].slices <= 12
     assert all(p.gain > NEEDED and p.gain_per_slice > 0.0 for p in ways)
+
+
+@pytest.mark.parametrize("after", [10.0, 30.0, 90.0])
+@pytest.mark.parametrize("gain", [0.1, 0.9, 1.1])
+def test_something_is_missing_of_each_pair_that_is_not_parted(after, gain):
+    pair = Pair("gain", "board", 5.0, after, gain * NEEDED, 1.0)
+    assert pair.parts == (after > 20.0 and gain > 1.0)
+    assert (pair.missing == 0.0) == pair.parts
 
 
 def test_of_presses_the_peeled_one_parts_a_skin_from_a_core(bench, monkeypatch):

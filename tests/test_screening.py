@@ -29,8 +29,8 @@ COLUMNS = [
     Column("base", "material.toughness"),
     Column("record", "toughness", per_record=True),
     Column("numerical", "mesh"),
-    # Its usual standard deviation is 1.5 ms (`linear.USUAL`), so 1 of the column's size.
-    Column("cause", "sensor_delay", "delay", scan=1.0, size=1.5e-3),
+    # Its usual standard deviation is 1 ms (`linear.USUAL`), so 1 of the column's size.
+    Column("cause", "sensor_delay", "delay", scan=1.0, size=1e-3),
     Column("cause", "plain", "x"),
     Column("cause", "bounded", "x", one_sided=True),
     Column("cause", "like_mesh", "x"),
@@ -180,7 +180,7 @@ def test_a_delay_within_the_usual_is_no_cause_and_one_far_beyond_is():
     assert known[0] == 0.0 and known[1] > 10.0
     # It acts most in rows that are doubted: less size is asked for than of what no sensor has.
     rule, delay = DecisionRule(), screening.evidence("sensor_delay")
-    assert rule.least_size(problem, delay) == rule.size_known < rule.size
+    assert rule.least_size(problem, delay) == rule.size_usual < rule.size
     assert rule.least_size(problem, screening.evidence("plain")) == rule.size
 
 

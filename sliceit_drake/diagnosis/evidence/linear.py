@@ -60,7 +60,7 @@ __all__ = [
 ]
 
 USUAL = {
-    ("sensor_delay", "delay"): (1.5e-3, False),
+    ("sensor_delay", "delay"): (1e-3, False),
     **{("sensor_zero", f"bias_{a}"): (0.1, True) for a in "xyz"},
     **{("sensor_zero", f"drift_{a}"): (0.02, True) for a in "xyz"},
 }

@@ -80,8 +80,9 @@ class DecisionRule:
             alone: no own error does that.
         size_instead: The same of an effect in whose place another would be named, of less evidence
             and with nothing to gain beside it.
-        size_known: The same where the food's file knows what the simulation gets wrong, and of what
-            every sensor has a little of, as a delay, which has to gain beyond that.
+        size_known: The same where the food's file knows what the simulation gets wrong.
+        size_usual: The same of what every sensor has a little of, as a delay, which has to gain
+            beyond that.
         limit: Level of the intervals of the causes' numbers.
         replicates: Slices of a condition from which variation can be told from an effect.
         presence: Share of the records in which a cause shows that has numbers of its own in each.
@@ -102,6 +103,7 @@ class DecisionRule:
     size_by_record: float = 0.5
     size_instead: float = 0.5
     size_known: float = 0.7
+    size_usual: float = 0.5
     limit: float = 0.1
     replicates: int = 3
     presence: float = 0.4
@@ -114,8 +116,10 @@ class DecisionRule:
         """Of a cause that is named."""
         if e.per_record:
             return self.size_by_record
+        if problem.found.known_from:
+            return self.size_known
         usual = set(problem.usual) & {*problem.found.of_causes([e.cause])}
-        return self.size_known if usual or problem.found.known_from else self.size
+        return self.size_usual if usual else self.size
 
 
 @dc.dataclass

@@ -51,8 +51,7 @@ class Pair:
     @property
     def missing(self) -> float:
         """By how much it is short of `WANTED`, degrees; an angle that noise hides counts less."""
-        seen = self.after * min(self.gain / NEEDED, 1.0)
-        return max(WANTED - seen, 0.0)
+        return WANTED - min(self.after, WANTED) * min(self.gain / NEEDED, 1.0)
 
 
 @dc.dataclass
