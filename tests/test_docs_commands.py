@@ -277,7 +277,7 @@ READ_ONLY = {
         sliceit calibrate calibration/records/potato.csv --food potato --start potato --output DIR
         sliceit calibrate --food carrot --literature --output DIR
         sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.85 --seed 32 --output old
-        sliceit record next.yaml --replicates 4 --effect skin --refinement 0.85 --seed 132 --output new
+        sliceit record next.yaml --replicates 5 --effect skin --refinement 0.85 --seed 132 --output new
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
