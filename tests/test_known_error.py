@@ -158,6 +158,10 @@ def test_a_sensor_is_as_late_as_it_was_in_the_records_that_an_error_is_known_fro
     )
     (usual,), (less,) = alone.usual.values(), then.usual.values()
     assert usual == pytest.approx(0.1) and less == pytest.approx(0.01)
+    # Where next to nothing is usual, more size is asked for.
+    rule, e = DecisionRule(), screen(alone, 20).evidence("sensor_delay")
+    assert rule.least_size(alone, e) == rule.size_usual < rule.size_known
+    assert rule.least_size(then, e) == rule.size_known
 
 
 def test_a_simulation_is_wrong_by_a_tenth_beyond_what_is_known():
