@@ -203,3 +203,15 @@ def test_a_file_that_clearly_predicts_left_out_records_worse_refutes_its_cause(r
     assert list(result.refuted()) == ["slice_push_law"]
     result.verdict.kind = "unknown"
     assert result.refuted() == {}
+
+
+def test_by_the_file_of_another_food_no_cause_is_named_that_slices_share(result):
+    result.shifts = {"material.friction": (1.0, 0.1), "material.toughness": (1.9, 0.1)}
+    assert result.refuted() == {}
+    for factor in (0.4, 2.53):
+        result.shifts["material.toughness"] = (factor, 0.1)
+        why = f"the file is of another food: material.toughness times {factor:.2f}"
+        assert result.refuted() == {"slice_push_law": why}
+    (finding,) = result.verdict.findings
+    finding.evidence.columns = [dc.replace(c, per_record=True) for c in finding.evidence.columns]
+    assert finding.evidence.per_record and result.refuted() == {}

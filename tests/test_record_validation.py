@@ -149,6 +149,11 @@ def no_tare(table: SliceTable) -> None:
     table.columns["force_z"] += 2.5
 
 
+def no_tare_and_a_spike_in_the_cut(table: SliceTable) -> None:
+    no_tare(table)
+    table.columns["force_z"][600] = 300.0
+
+
 def no_tare_said(table: SliceTable) -> None:
     no_tare(table)
     table.metadata.wrench.tared = "no"
@@ -323,6 +328,7 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (mostly_nan, "error", "gap", "line 1500: force_z: 1 of 1500 rows"),
         (nan_pose, "error", "gap", "lines 602 to 641: p_WK_z: 40 of 1500 rows"),
         (no_tare, "warning", "no tare", "lines 2 to 251: force_z: .*2.5 N.*tared is yes. Apply"),
+        (no_tare_and_a_spike_in_the_cut, "warning", "no tare", "force_z: .*2.5 N in the mean"),
         (no_tare_said, "warning", "no tare", "wrench.tared is no. Apply the step tare"),
         (flipped_sign, "error", "flipped sign", "lines 252 to 926: force_z.*Write wrench.sign: by"),
         (flipped_sign_of_an_offset_sensor, "error", "flipped sign", "force_z: .*the force on"),

@@ -1,5 +1,7 @@
 """Checks of the force in a slice record: units, sign, taring, saturation, a dead sensor."""
 
+import dataclasses as dc
+
 import numpy as np
 from scipy.integrate import trapezoid
 
@@ -41,17 +43,18 @@ ALONG = 0.2
 
 def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
     """Adds to the findings what is wrong with the force, of a table and its record in W."""
+    measured, record = record, _without_spikes(record)
     magnitude = record.force_magnitude
     name = record.force_columns[0]
-    if np.ptp(magnitude) == 0.0:
+    if np.ptp(measured.force_magnitude) == 0.0:
         if record.is_of_air:
             # A sensor that reads in coarse steps feels nothing there.
             return
         findings.add("constant", name, f"is {magnitude[0]:.6g} N in every row")
         return
-    if record.force_norm is not None and (record.force_norm < 0.0).any():
-        k = int(record.force_norm.argmin())
-        findings.add("negative norm", name, f"a norm is {record.force_norm[k]:.4g} N", (k, k))
+    if measured.force_norm is not None and (measured.force_norm < 0.0).any():
+        k = int(measured.force_norm.argmin())
+        findings.add("negative norm", name, f"a norm is {measured.force_norm[k]:.4g} N", (k, k))
     air = record.first_phase("air")
     cut = record.phase("slice", "second_pass")
     if not record.metadata.motion.phases:
@@ -64,10 +67,17 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
         _check_units(record, air, cut, name, findings)
         if not findings.has("kilonewtons"):
             _check_sign(table, record, air, cut, findings)
-    _check_saturation(table, record, findings)
+    _check_saturation(table, measured, findings)
     _check_frozen(table, cut, findings)
     if record.metadata.motion.phases and not findings.has("clipped", "frozen", "kilonewtons"):
         _check_end(record, air, record.first_phase("slice"), findings)
+
+
+def _without_spikes(record: SliceRecord) -> SliceRecord:
+    force = without_spikes(record.measured_force)[0]
+    if record.force is not None:
+        return dc.replace(record, force=force)
+    return dc.replace(record, **{record.force_columns[0]: force[:, 0]})
 
 
 def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
@@ -92,8 +102,8 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
         return
     if record.phase("air").all():
         return  # Such a record is there to show zero and drift; no force makes them large or small.
-    force = without_spikes(record.measured_force)[0]
-    mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
+    force = record.measured_force[air]
+    mean, scatter = force.mean(axis=0), force.std(axis=0)
     peak = float(record.force_magnitude.max())
     # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.
     is_norm = record.force_norm is not None
@@ -164,12 +174,10 @@ def _ends(mask: np.ndarray) -> tuple[int, int]:
 
 
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
-    """Standard deviation in the air of the noisiest component, N, after drift, without spikes; 0 if
-    not known."""
-    force = without_spikes(record.measured_force)[0]
+    """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
     if air.sum() < MIN_AIR_ROWS:
         return 0.0
-    return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
+    return float(np.diff(record.measured_force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
 
 
 def _section_area(record: SliceRecord) -> float | None:
@@ -299,7 +307,7 @@ def _check_end(record: SliceRecord, air: np.ndarray, cut: np.ndarray, findings: 
     rows = np.flatnonzero(cut)
     if len(rows) < 2 * MIN_AIR_ROWS:
         return
-    force = without_spikes(record.measured_force)[0][rows]
+    force = record.measured_force[rows]
     force = force[:, [np.ptp(force, axis=0).argmax()]]
     around = np.median(force[-max(MIN_AIR_ROWS, len(rows) // 20) :])
     least = max(LEVEL * np.ptp(force), 5.0 * _noise(record, air))

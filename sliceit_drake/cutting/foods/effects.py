@@ -106,16 +106,28 @@ class Resting(Relaxation):
     """Way of the knife over which a force that faded comes back to 1 - 1/e."""
 
     def faded(
-        self, held: np.ndarray, speed: float, touches: bool, period: float
-    ) -> tuple[np.ndarray, float]:
-        """How far each branch has come [M], and the share of the force that is gone, at the end of
-        a coupling step in which the knife moves at `speed`, m/s; `touches` food or not."""
-        times = np.array(self.times, float)
-        if touches and speed < RESTING:
-            held = 1.0 - (1.0 - held) * np.exp(-period / times)
-        else:
-            held = held * np.exp(-speed * period / self.travel)
-        return held, float(np.array(self.shares) @ held)
+        self, held: np.ndarray, speed: np.ndarray, touches: np.ndarray, period: float
+    ) -> np.ndarray:
+        """How far each branch has come [N, M] at the ends of coupling steps.
+
+        Args:
+            held: The same before the first step [M].
+            speed: Of the knife in each step [N], m/s.
+            touches: Whether it touches food in each step [N].
+            period: Of the steps, s.
+        """
+        rests = touches & (speed < RESTING)
+        times, way = np.array(self.times, float), speed * period / self.travel
+        out = np.empty((len(speed), len(times)))
+        ends = [*np.flatnonzero(rests[1:] != rests[:-1]) + 1, len(speed)]
+        for begin, end in zip([0, *ends], ends, strict=False):
+            if rests[begin]:
+                spent = period * np.arange(1.0, end - begin + 1.0)
+                out[begin:end] = 1.0 - (1.0 - held) * np.exp(-spent[:, None] / times)
+            else:
+                out[begin:end] = held * np.exp(-np.cumsum(way[begin:end]))[:, None]
+            held = out[end - 1]
+        return out
 
 
 @dc.dataclass
@@ -430,9 +442,9 @@ class Effects:
         out = parts.copy()
         out[:, 0, 3:] += self.slice_push.pull * along[:, None] * edge
         held = np.zeros(len(self.resting.shares)) if held is None else held
-        if any(self.resting.shares):
+        if any(self.resting.shares) and len(parts):
             touches = np.abs(parts[:, :, 3:]).max((1, 2)) > 1e-9
-            for k, (v, touching) in enumerate(zip(speed.tolist(), touches.tolist(), strict=True)):
-                held, gone = self.resting.faded(held, v, touching, period)
-                out[k] -= gone * parts[k]
+            came = self.resting.faded(held, speed, touches, period)
+            out -= (came @ np.array(self.resting.shares))[:, None, None] * parts
+            held = came[-1]
         return out, held
