@@ -39,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     with tempfile.TemporaryDirectory() as folder:
-        records, output, food = (f"{folder}/{name}" for name in ("records", "diagnosis", "food.yaml"))
+        records, output, food = (
+            f"{folder}/{name}" for name in ("records", "diagnosis", "food.yaml")
+        )
         sliceit("record", PROTOCOL, "--effect", EFFECT, "--output", records, "--seed", "1")
         cut = load_protocol(PROTOCOL)
         dump_yaml(CalibratedFood(food=cut.food, knife=cut.knife), Path(food))
