@@ -12,6 +12,7 @@ from sliceit_drake.calibration.first_fit import first_fit
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.records.metadata import Phase
 from sliceit_drake.records.slice_record import write_record
 
 
@@ -105,3 +106,36 @@ def test_records_that_do_not_belong_together_are_refused_before_the_first_fit(
     words = [f"{word}.csv" if word in "ab" else word for word in words]
     assert main(["calibrate", *words, "--output", "out"]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_record_of_no_cut_is_not_fitted_and_replicates_choose_no_structure_twice(
+    tmp_path, monkeypatch, capsys
+):
+    fitted, chosen = [], []
+
+    def stop(directory, setup, records, *_):
+        chosen.extend(record.name for record in records)
+        raise ConfigurationError("enough")
+
+    def note(setup, records, *_):
+        fitted.extend(record.name for record in records)
+        raise CuttingError("no fit")
+
+    monkeypatch.setattr(module, "first_fit", note)
+    monkeypatch.setattr("sliceit_drake.calibration.structure.choice_in", stop)
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("air", "press_1", "press_2")):
+        record = example_slice(seed=seed)
+        record.metadata.name, record.metadata.condition = name, name.split("_")[0]
+        if name == "air":
+            record.metadata.motion.phases = [Phase("air", 0.0, float(record.time[-1]))]
+        write_record(record, tmp_path / "records" / name)
+    command = ["calibrate", "records", "--output", "out"]
+    assert main(command) == 2
+    said = capsys.readouterr()
+    assert "Not fitted, since no phase of theirs cuts food: air" in said.out
+    assert "enough" in said.err and fitted == ["press_1", "press_2"] and chosen == ["press_1"]
+    assert main([*command, "--hold-out", "air"]) == 2
+    assert "'air' is not among the cuts press_1, press_2" in capsys.readouterr().err
+    assert main(["calibrate", "records/air.csv", "--output", "out"]) == 2
+    assert "no phase of any record is labelled slice or second_pass" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.structure import coarse_predictor, first_starts
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.record_set import one_of_each
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["FirstFit", "first_fit", "fit_from_starts"]
@@ -67,10 +68,7 @@ def first_fit(
         ConfigurationError: A record cannot be predicted.
         CuttingError: No start leads to slices that can be cut.
     """
-    first: dict[str, SliceRecord] = {}
-    for record in records:
-        first.setdefault(record.metadata.condition or record.name, record)
-    predictor = coarse_predictor(setup, list(first.values())[:MOST], workers)
+    predictor = coarse_predictor(setup, one_of_each(records)[:MOST], workers)
     unit = fit_from_starts(predictor, progress)
     (row,) = predictor.predict([unit])
     return FirstFit(predictor, row, predictor.error(row), force_band(predictor, unit))

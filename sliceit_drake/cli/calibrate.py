@@ -53,6 +53,8 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
+CUT = ("slice", "second_pass")
+"""Phases in which a knife cuts."""
 TRIALS = 500
 """Of a search."""
 
@@ -199,43 +201,53 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.calibration.storage import open_storage, without_password
     from sliceit_drake.calibration.structure import choice_in, puncture_lines
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-    from sliceit_drake.prediction.record_set import check_foods, check_same_slice
+    from sliceit_drake.prediction.record_set import check_foods, check_same_slice, one_of_each
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = None if options.food is None else load_setup(options.food)
     records = [load_record(file) for path in options.records for file in record_files(path)]
     if not records:
         raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
+    cuts = [r for r in records if not r.metadata.motion.phases or r.phase(*CUT).any()]
+    names = [record.name for record in cuts]
+    if idle := [record.name for record in records if record.name not in names]:
+        print(f"Not fitted, since no phase of theirs cuts food: {', '.join(idle)}")
+    if not cuts:
+        raise ConfigurationError(
+            f"no phase of any record is labelled {' or '.join(CUT)}",
+            field="motion.phases",
+            fix="Give a record of a cut, or label the cut in it (`sliceit records check`).",
+        )
     if setup is None:
-        setup = setup_of_record(records[0])
-    check_same_slice(records)
+        setup = setup_of_record(cuts[0])
+    check_same_slice(cuts)
     fix = "Give a setup of {} by --food, or leave --food out"
-    check_foods(records, setup.food.name, "setup", fix, options.other_food)
+    check_foods(cuts, setup.food.name, "setup", fix, options.other_food)
     for record in records:
         for finding in check_record(record):
             print(finding)
-    names = [record.name for record in records]
     for name in options.hold_out:
         if name not in names:
             raise ConfigurationError(
-                f"{name!r} is not among the records {', '.join(names)}",
+                f"{name!r} is not among the cuts {', '.join(names)}",
                 field="--hold-out",
                 fix="Give the names of records that are given.",
             )
     if options.storage is not None:
         # One that cannot be opened is said before anything is computed.
         open_storage(options.storage)
-    fitted = [r for r in records if r.name not in options.hold_out]
+    fitted = [r for r in cuts if r.name not in options.hold_out]
     start = values_of(load_calibrated_food(options.start)) if options.start else None
     warnings: list[str] = []
     if start is None:
         _first_fit(setup, fitted, options)
     if options.structure == "choose":
         with StageBars() as bars:
+            bars.show("structures", 0, None)
             choice = choice_in(
                 options.output,
                 setup,
-                fitted,
+                one_of_each(fitted),
                 options.workers,
                 lambda done, all, error: bars.show_error("structures", done, all, error),
             )
@@ -257,7 +269,7 @@ def _calibrate(options: argparse.Namespace) -> int:
                 block_length=options.block_length,
                 start=start,
             ),
-            [r for r in records if r.name in options.hold_out],
+            [r for r in cuts if r.name in options.hold_out],
             bars.show_error,
         )
     if options.structure == "setup":
@@ -269,7 +281,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     if options.per_point:
         _fit_points(options, result)
     if len(fitted) > 1:
-        _learn_known_error(fitted, options)
+        _learn_known_error([r for r in records if r.name not in options.hold_out], options)
     print(f"Results in {options.output}/")
     return 0
 

@@ -7,7 +7,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["check_foods", "check_same_slice", "facts_file"]
+__all__ = ["check_foods", "check_same_slice", "facts_file", "one_of_each"]
 
 UNNAMED = ("", "unknown")
 
@@ -15,6 +15,14 @@ UNNAMED = ("", "unknown")
 def facts_file(record: SliceRecord) -> str:
     """The YAML file of a record."""
     return str(Path(record.source).with_suffix(".yaml"))
+
+
+def one_of_each(records: Sequence[SliceRecord]) -> list[SliceRecord]:
+    """The first record of each condition, and those of none."""
+    first: dict[str, SliceRecord] = {}
+    for record in records:
+        first.setdefault(record.metadata.condition or record.name, record)
+    return list(first.values())
 
 
 def check_same_slice(records: Sequence[SliceRecord]) -> None:

@@ -77,7 +77,9 @@ def _without_spikes(record: SliceRecord) -> SliceRecord:
     force = without_spikes(record.measured_force)[0]
     if record.force is not None:
         return dc.replace(record, force=force)
-    return dc.replace(record, **{record.force_columns[0]: force[:, 0]})
+    if record.force_norm is not None:
+        return dc.replace(record, force_norm=force[:, 0])
+    return dc.replace(record, force_vertical=force[:, 0])
 
 
 def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
