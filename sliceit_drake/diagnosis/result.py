@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 __all__ = ["Diagnosis"]
 
 ANOTHER_FOOD = np.log(2.0)
-"""Logarithm of a shift of a base parameter from which on no cause that slices share is named."""
+"""Logarithm of a shift of a base parameter, less two standard errors, from which on a cause that
+slices share is named only if its file clearly predicts left-out records better."""
 
 
 @dc.dataclass
@@ -100,8 +101,8 @@ class Diagnosis:
 
     def refuted(self) -> dict[str, str]:
         """Named causes that simulations do not bear out, by name, with the reason: a number ends at
-        a bound, the food's file is of another food, whose derivatives say little about this one, or
-        the extended food clearly predicts records that were left out worse, which is laid to the
+        a bound, the food's file is of another food and the extended one does not clearly predict
+        records that were left out better, or it clearly predicts them worse, which is laid to the
         cause with least evidence."""
         named = self.verdict.findings if self.verdict.names else []
         shared = [f for f in named if not f.evidence.per_record]
@@ -112,10 +113,13 @@ class Diagnosis:
                 away = values[c.parameter] - cause.parameter(c.parameter).null
                 if away != 0.0 and not c.low < away < c.high:
                     out[cause.name] = f"a simulation takes {c.parameter} to a bound"
-        far = [n for n, (factor, _) in self.shifts.items() if abs(np.log(factor)) >= ANOTHER_FOOD]
-        if not out and far:
-            why = f"the file is of another food: {far[0]} times {self.shifts[far[0]][0]:.2f}"
-            return dict.fromkeys((f.evidence.name for f in shared), why)
+        far = [
+            f"{name} times {factor:.2f}"
+            for name, (factor, error) in self.shifts.items()
+            if abs(np.log(factor)) - 2.0 * error >= ANOTHER_FOOD
+        ]
+        if not out and far and not (self.gain is not None and self.gain.interval[0] > 0.0):
+            return {f.evidence.name: f"the file is of another food: {far[0]}" for f in shared}
         if not out and shared and self.gain is not None and self.gain.interval[1] <= 0.0:
             weakest = min(shared, key=lambda f: f.evidence.gain)
             out[weakest.evidence.name] = "its file predicts records that were left out worse"
