@@ -53,8 +53,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
-CUT = ("slice", "second_pass")
-"""Phases in which a knife cuts."""
 TRIALS = 500
 """Of a search."""
 
@@ -208,21 +206,21 @@ def _calibrate(options: argparse.Namespace) -> int:
     records = [load_record(file) for path in options.records for file in record_files(path)]
     if not records:
         raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
-    cuts = [r for r in records if not r.metadata.motion.phases or r.phase(*CUT).any()]
+    cuts = [record for record in records if record.cut_rows.any()]
     names = [record.name for record in cuts]
     if idle := [record.name for record in records if record.name not in names]:
         print(f"Not fitted, since no phase of theirs cuts food: {', '.join(idle)}")
     if not cuts:
         raise ConfigurationError(
-            f"no phase of any record is labelled {' or '.join(CUT)}",
+            "no phase of any record is labelled slice or second_pass",
             field="motion.phases",
             fix="Give a record of a cut, or label the cut in it (`sliceit records check`).",
         )
     if setup is None:
         setup = setup_of_record(cuts[0])
-    check_same_slice(cuts)
+    check_same_slice(records)
     fix = "Give a setup of {} by --food, or leave --food out"
-    check_foods(cuts, setup.food.name, "setup", fix, options.other_food)
+    check_foods(records, setup.food.name, "setup", fix, options.other_food)
     for record in records:
         for finding in check_record(record):
             print(finding)

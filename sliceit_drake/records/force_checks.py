@@ -56,9 +56,7 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
         k = int(measured.force_norm.argmin())
         findings.add("negative norm", name, f"a norm is {measured.force_norm[k]:.4g} N", (k, k))
     air = record.first_phase("air")
-    cut = record.phase("slice", "second_pass")
-    if not record.metadata.motion.phases:
-        cut = np.ones(len(record), bool)
+    cut = record.cut_rows
     _check_tare(record, air, findings)
     if magnitude.max() > GREATEST_FORCE:
         k = int(magnitude.argmax())

@@ -102,9 +102,7 @@ def _check_jumps(record: SliceRecord, findings: Findings) -> None:
 
 def _check_upright(record: SliceRecord, findings: Findings) -> None:
     """A knife whose edge points up in most rows of the slice is placed wrongly on the tool."""
-    cut = record.phase("slice", "second_pass")
-    if not record.metadata.motion.phases:
-        cut = np.ones(len(record), bool)
+    cut = record.cut_rows
     up = np.flatnonzero(cut & (record.rotation[:, 2, 2] >= 0.0))
     if 2 * len(up) > cut.sum():
         text = "the knife is upside down: z of K does not point down while slicing"

@@ -163,6 +163,13 @@ class SliceRecord:
         return self._rows_of([p for p in self.metadata.motion.phases if p.label in labels])
 
     @property
+    def cut_rows(self) -> np.ndarray:
+        """Bool mask [n] of the rows in which the knife cuts; all where no phase is labelled."""
+        if not self.metadata.motion.phases:
+            return np.ones(len(self), bool)
+        return self.phase("slice", "second_pass")
+
+    @property
     def is_of_air(self) -> bool:
         """Whether all of its phases are in the air."""
         labels = {phase.label for phase in self.metadata.motion.phases}

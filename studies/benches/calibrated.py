@@ -19,6 +19,7 @@ from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
 from sliceit_drake.diagnosis.prediction import Point, SlicePredictor
+from sliceit_drake.prediction.record_set import one_of_each
 from sliceit_drake.records.slice_record import SliceRecord
 from studies.benches.draw import LAWS, PARTS, Draw, seed_of
 from studies.pages import percent, publish, table
@@ -57,11 +58,7 @@ class Misfit:
 
 def food_records(records: Sequence[SliceRecord]) -> list[SliceRecord]:
     """The first record of each condition that cuts."""
-    found: dict[str, SliceRecord] = {}
-    for record in records:
-        if record.phase("slice").any():
-            found.setdefault(record.metadata.condition, record)
-    return list(found.values())
+    return one_of_each([record for record in records if record.phase("slice").any()])
 
 
 class _Fit:
