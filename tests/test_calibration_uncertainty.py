@@ -12,7 +12,7 @@ from sliceit_drake.calibration import uncertainty
 from sliceit_drake.calibration.calibrate import blocked_error
 from sliceit_drake.calibration.gauss_newton import gauss_newton, linearise, residuals_at
 from sliceit_drake.calibration.prediction import Parameter
-from sliceit_drake.calibration.uncertainty import Posterior, estimate
+from sliceit_drake.calibration.uncertainty import FITS, ROUNDS, Posterior, estimate
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel, group_series
@@ -174,7 +174,9 @@ def test_least_squares_stand_where_the_noise_gives_up_the_force_of_a_model_that_
     model.measured = 5.0 * x - 3.0 * (x > 0.97)
     model.measured += 0.01 * np.random.default_rng(1).normal(size=150)
     fit = gauss_newton(model, np.array([0.5]))
-    found = estimate(model, fit.unit)
+    shown: list[int] = []
+    found = estimate(model, fit.unit, progress=shown.append)
+    assert shown == list(range(len(shown))) and 2 <= len(shown) < FITS * ROUNDS
     assert found.unit == pytest.approx(fit.unit, abs=0.02)
     assert "the model lacks something that noise does not explain" in found.posterior.notes[-1]
     # Their covariance allows for what goes on along the cut.

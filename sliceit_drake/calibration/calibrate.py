@@ -18,7 +18,7 @@ from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.calibration.uncertainty import estimate
+from sliceit_drake.calibration.uncertainty import FITS, ROUNDS, estimate
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
@@ -149,9 +149,11 @@ def calibrate(
     polished_rms, unit = best
     if not np.isfinite(polished_rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
-    show("uncertainty", 0, 1, polished_rms)
-    estimated = estimate(predictor, unit)
-    show("uncertainty", 1, 1, polished_rms)
+    rounds = FITS * ROUNDS
+    estimated = estimate(
+        predictor, unit, progress=lambda done: show("uncertainty", done, rounds, polished_rms)
+    )
+    show("uncertainty", rounds, rounds, polished_rms)
     unit, posterior = estimated.unit, estimated.posterior
     (predictions,) = predictor.predict([unit])
     rms = predictor.error(predictions)

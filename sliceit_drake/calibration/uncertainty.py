@@ -1,6 +1,8 @@
 """How well records determine the parameters: posterior, and what they cannot tell."""
 
 import dataclasses as dc
+import itertools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,9 +24,12 @@ from sliceit_drake.cutting.foods.distribution import (
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel, NoiseProblem, group_series
 
-__all__ = ["Estimate", "Posterior", "estimate"]
+__all__ = ["FITS", "ROUNDS", "Estimate", "Posterior", "estimate"]
 
 ROUNDS = 6
+"""Most alternations of noise and parameters in a weighted fit."""
+FITS = 5
+"""Most weighted fits of an estimate."""
 STEPS = 3
 SETTLED = 0.1
 """Largest move, in standard deviations, with which the alternation of noise and fit ends."""
@@ -148,7 +153,12 @@ class Estimate:
     covariance: np.ndarray
 
 
-def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estimate:
+def estimate(
+    model: Predictor,
+    unit: np.ndarray,
+    rounds: int = ROUNDS,
+    progress: Callable[[int], None] | None = None,
+) -> Estimate:
     """Fits parameters and noise in turn until the parameters rest.
 
     The parameters minimise the residuals weighted with the noise's covariance (generalised least
@@ -162,19 +172,29 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
 
     Args:
         unit: The fit of least squares [d].
-        rounds: Most alternations.
+        rounds: Most alternations of a fit.
+        progress: Called before each alternation with the number of those done, less than
+            `FITS * rounds`.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
+    done = itertools.count()
+
+    def show() -> None:
+        if progress is not None:
+            progress(next(done))
+
     start = np.clip(unit, 0.0, 1.0)
     usual, (first,) = model, residuals_at(model, [start])
     unknown = any(p.name.startswith(HEIGHT) for p in usual.parameters)
-    place = _among_heights(usual, start, rounds) if unknown and _repeated(usual) else start
+    place = start
+    if unknown and _repeated(usual):
+        place = _among_heights(usual, start, rounds, show)
     for _ in range(2):
         # Taken off anew where the fit ends, if that is elsewhere.
         model = usual.without_step_error(place)
-        weighted = _weighted(model, place, rounds)
+        weighted = _weighted(model, place, rounds, show)
         at, problem, noise = weighted.at, weighted.problem, weighted.noise
         moved, place = at.unit - place, at.unit
         if (np.abs(moved) < SETTLED * np.sqrt(np.diag(problem.covariance()))).all():
@@ -208,12 +228,15 @@ class _Weighted:
     noise: NoiseModel
 
 
-def _weighted(model: Predictor, start: np.ndarray, rounds: int) -> _Weighted:
+def _weighted(
+    model: Predictor, start: np.ndarray, rounds: int, show: Callable[[], None]
+) -> _Weighted:
     """Fits parameters and noise in turn from a place [d]."""
     at = linearise(model, start)
     problem = _noise_problem(model, at)
     noise = problem.fit()
     for _ in range(rounds):
+        show()
         fit = gauss_newton(
             model, at.unit, noise=noise, steps=STEPS, tolerance=1e-5, linearisation=at
         )
@@ -232,16 +255,18 @@ def _repeated(model: Predictor) -> bool:
     return len({n for n in named if n}) < len([n for n in named if n])
 
 
-def _among_heights(model: Predictor, start: np.ndarray, rounds: int) -> np.ndarray:
+def _among_heights(
+    model: Predictor, start: np.ndarray, rounds: int, show: Callable[[], None]
+) -> np.ndarray:
     """Places [d] of the most probable of several weighted fits.
 
     Least squares makes up with heights for what slices differ in, and waves of the force over the
     elements may hold them there.
     """
-    best, place = _weighted(model, start, rounds), start
+    best, place = _weighted(model, start, rounds, show), start
     for _ in range(2):
         try:
-            other = _weighted(model, _with_heights(model, place), rounds)
+            other = _weighted(model, _with_heights(model, place), rounds, show)
             best = min(best, other, key=lambda each: each.problem.cost)
         except CuttingError:
             # At these heights a slice breaks down: the best so far stays.
