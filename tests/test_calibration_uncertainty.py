@@ -3,6 +3,7 @@
 import copy
 import dataclasses as dc
 import json
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -225,6 +226,15 @@ def test_a_record_that_breaks_down_with_small_sub_steps_is_noted():
     model.step_unknown = ["one"]
     notes = estimate(model, truth).posterior.notes
     assert any("one: breaks down with small sub-steps" in line for line in notes)
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_a_value_beyond_its_range_starts_at_the_end_of_it(log):
+    parameter = Parameter("p", 1.0, 100.0, log, 10.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [parameter.unit(x) for x in (-2.0, 0.0, 1.0)] == [0.0, 0.0, 0.0]
+        assert [parameter.unit(x) for x in (100.0, 1e3)] == [1.0, 1.0]
 
 
 def test_what_only_enters_in_a_combination_is_named():

@@ -73,7 +73,8 @@ class Parameter:
 
     def unit(self, value: float) -> float:
         """Place of a value in the range, within 0 and 1."""
-        return float(np.clip(to_unit(value, self.low, self.high, self.log), 0.0, 1.0))
+        inside = min(max(value, self.low), self.high)
+        return float(to_unit(inside, self.low, self.high, self.log))
 
 
 @dc.dataclass
