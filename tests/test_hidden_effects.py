@@ -267,22 +267,27 @@ def test_a_study_is_judged_alike_from_its_runs_in_one_file(tmp_path):
     other = Case("decaf0", "poor", "poor", (Hidden("core", 0.3, 2.1),), 2)
     evidence = [{"cause": "skin", "held_out_share": 0.8, "gain": 12.0}]
     facts = {"verdict": "cause", "classes": [["skin"]], "evidence": evidence, "shifts": {}}
-    for one in (case, other):
+    # Right, since no records tell a core from the law.
+    near_by = Case("facade", "single", "rich", (Hidden("core", 0.5, 2.4),), 3)
+    group = {"cause": "core", "others": ["skin", "law"], "values": {"weakening": 0.3}}
+    unknown = facts | {"verdict": "unknown", "classes": [], "findings": [group]}
+    for one in (case, other, near_by):
         for folder, file, values in (
             ("truth", f"{one.name}.json", dc.asdict(one)),
             (f"runs/{one.name}", "timing.json", {"diagnosis_s": 3.0, "code": "a"}),
         ):
             (study / folder).mkdir(parents=True, exist_ok=True)
             (study / folder / file).write_text(json.dumps(values))
-    (study / "runs" / case.name / "diagnosis.json").write_text(json.dumps(facts))
+    for one, said_of_it in ((case, facts), (near_by, unknown)):
+        (study / "runs" / one.name / "diagnosis.json").write_text(json.dumps(said_of_it))
     for name, values in (("study", {"seed": 1}), ("near", NEAR), ("classes", {})):
         (study / f"{name}.json").write_text(json.dumps(values))
-    assert pack(study, tmp_path / "runs.jsonl") == 2
+    assert pack(study, tmp_path / "runs.jsonl") == 3
     unpack(tmp_path / "runs.jsonl", tmp_path / "again")
     first, again = (judge_study(folder) for folder in (study, tmp_path / "again"))
     assert repr(first) == repr(again)
-    assert [j.verdict for j in again] == ["cause", "failed"]
-    assert again[0].right and again[0].oracle == 0.8
+    assert [j.verdict for j in again] == ["cause", "failed", "unknown"]
+    assert [j.right for j in again] == [True, False, True] and again[0].oracle == 0.8
     # What was run since then stays.
     (tmp_path / "again" / "runs" / case.name / "diagnosis.json").write_text(
         json.dumps(facts | {"verdict": "unknown"})

@@ -21,7 +21,8 @@ __all__ = ["pack", "unpack"]
 SHARED = (OPTIONS, CASES, NEAR, CLASSES)
 """What all runs of a study have in common."""
 SAID = ("verdict", "classes", "gain", "shifts", "misfit_over_noise")
-"""What is kept of a diagnosis beside the held-out fractions of its causes."""
+"""What is kept of a diagnosis beside the groups of its findings and the held-out fractions of its
+causes."""
 
 
 def pack(output: Path, file: Path) -> int:
@@ -85,8 +86,9 @@ def _said(facts: Mapping[str, Any] | None) -> dict[str, Any] | None:
     shares = [
         {"cause": e["cause"], "held_out_share": e.get("held_out_share")} for e in facts["evidence"]
     ]
+    groups = [{"cause": f["cause"], "others": f["others"]} for f in facts.get("findings", [])]
     out = {name: facts.get(name) for name in SAID}
-    return {**out, "evidence": shares}
+    return {**out, "findings": groups, "evidence": shares}
 
 
 def _write(file: Path, facts: Mapping[str, Any]) -> None:
