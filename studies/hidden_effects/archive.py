@@ -86,9 +86,11 @@ def _said(facts: Mapping[str, Any] | None) -> dict[str, Any] | None:
     shares = [
         {"cause": e["cause"], "held_out_share": e.get("held_out_share")} for e in facts["evidence"]
     ]
-    groups = [{"cause": f["cause"], "others": f["others"]} for f in facts.get("findings", [])]
-    out = {name: facts.get(name) for name in SAID}
-    return {**out, "findings": groups, "evidence": shares}
+    out = {name: facts.get(name) for name in SAID} | {"evidence": shares}
+    # Files of before 29 November do not have them.
+    if "findings" in facts:
+        out["findings"] = [{k: f[k] for k in ("cause", "others")} for f in facts["findings"]]
+    return out
 
 
 def _write(file: Path, facts: Mapping[str, Any]) -> None:
