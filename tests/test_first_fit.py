@@ -1,6 +1,7 @@
 """The first fit of a calibration, on a coarse mesh."""
 
 import copy
+import shutil
 
 import numpy as np
 import pytest
@@ -139,3 +140,8 @@ def test_a_record_of_no_cut_is_not_fitted_and_replicates_choose_no_structure_twi
     assert "'air' is not among the cuts press_1, press_2" in capsys.readouterr().err
     assert main(["calibrate", "records/air.csv", "--output", "out"]) == 2
     assert "no phase of any record is labelled slice or second_pass" in capsys.readouterr().err
+    # What is not fitted is checked, too.
+    for end in (".csv", ".yaml"):
+        shutil.copy(f"records/air{end}", f"records/again{end}")
+    assert main(command) == 2
+    assert "holds the same measurement" in capsys.readouterr().err
